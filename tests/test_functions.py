@@ -195,7 +195,13 @@ def swept(function, over=None, **options):
         (lambda: dt.sweep(dt.floquet, Unregistered(**SHAFT.values), over={"beta": [0.1]}), "got Unregistered, which is not"),
         (lambda: dt.sweep(dt.floquet, SHAFT, over={"beta": [[0.1]]}), r"over.beta: got an array of the shape \(1, 1\)"),
         (lambda: swept(lambda p: {"outcome": p["a"]}), "outcome: the function returns float64 of the shape"),
-        (lambda: dt.sweep(lambda p: p["a"], {"a": 1.0}, over={"b": [1.0]}), "over.b: unknown to a dict"),
+        (lambda: swept(len, {"k": [0.0, 1.0]}), r'k: an array cannot vary as a whole; allowed is one entry, .* "k\[0\]"'),
+        (lambda: swept(len, {"l": [0.0, 1.0]}), "over.l: a list cannot vary as a whole"),
+        (lambda: swept(len, {"k[3]": [0.0, 1.0]}), r"over.k\[3\]: allowed is k\[0\] to k\[2\]"),
+        (lambda: swept(len, {"a[0]": [0.0, 1.0]}), r"over.a\[0\]: a is not a list; allowed is a"),
+        (lambda: swept(len, {"aa": [0.0, 1.0]}), r"over.aa: unknown to a dict \(did you mean a\?\); allowed is a, k, l"),
+        (lambda: dt.sweep(len, SHAFT, over={"name": [1.0]}), "over.name: unknown to a Cardan.*; allowed is beta, Omega, "),
+        (lambda: dt.sweep(abs, 1.0, over={"a": [0.0, 1.0]}), "system: got a float; allowed is a pytree"),
         (lambda: dt.sweep(lambda p: {"a": p["a"]}, {"a": 1.0}, over={"a": [1.0]}), "over: 'a' names two dimensions"),
     ],
 )  # fmt: skip
@@ -233,6 +239,17 @@ def test_any_function_is_swept_resumed_and_refused(tmp_path):
     assert out.stat().st_mtime_ns == before
     with pytest.raises(dt.InputError, match="another scene"):
         dt.sweep(one(2.0), pytree, over=over, out=out)
+
+
+@pytest.mark.parametrize("name", ["k[1]", "l[1]"])
+def test_a_swept_entry_keeps_its_array_or_list(name):
+    """Also an array of integers, whose type does not hold the value."""
+    found = dt.sweep(
+        lambda p: {"r": p["k"].sum() + (p["l"] + [0.0])[1]},
+        {"k": np.arange(3), "l": [9.0, 1.0]},
+        over={name: [0.5, 7.0]},
+    )
+    np.testing.assert_array_equal(found.r, [3.5, 10.0])
 
 
 def test_a_chart_of_gradients():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ from jax import Array
 from drivetrain_jax import analyses, functions
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax._wording import shown
+from drivetrain_jax._wording import nearest, shown
 from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analysis_names
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.analysis.request import checked
@@ -51,8 +51,8 @@ def sweep(
         function: an analysis such as :func:`drivetrain_jax.floquet`, or any JAX function of a pytree that returns an array,
             a dict of arrays, or the result of an analysis.
         system: the pytree; values that are not in ``over`` stay fixed.
-        over: values ``(N,)`` by name of a parameter, an entry of a list (``"length[1]"``), a key or an attribute. A value
-            may be a text with a unit, ``"18 deg"``.
+        over: values ``(N,)`` by name of a parameter, an entry of a list or array (``"length[1]"``), a key or an attribute.
+            A value may be a text with a unit, ``"18 deg"``.
         out: a netCDF file. The next call resumes unfinished work, and only reads a finished result.
         outputs: variables to compute; default: the default of the analysis, or all.
         options: options of the analysis, or keyword arguments of the function.
@@ -135,6 +135,8 @@ def _function_scene(
     options: Mapping[str, Any],
 ) -> Scene:
     """The scene of a user's function: its parameters vary, and a fixed word identifies the computation."""
+    if jax.tree_util.treedef_is_leaf(jax.tree.structure(system)):
+        raise InputError(f"system: got a {type(system).__name__}; allowed is a pytree, such as a dict of numbers")
     known = {p.name: p for p in system.parameters} if isinstance(system, System) else {}
     values = {}
     for name, given in over.items():
@@ -256,16 +258,55 @@ def _check_outcome(shapes: Mapping[str, jax.ShapeDtypeStruct]) -> None:
 
 
 def _replaced(system: Any, point: Mapping[str, Any]) -> Any:
-    """``system`` with these parameters, keys or attributes replaced."""
+    """``system`` with these parameters, keys or attributes, or entries of them, replaced."""
     for name, value in point.items():
         base, entry = entry_of(name)
-        try:
-            old = system[base] if isinstance(system, Mapping) else getattr(system, base)
-        except (AttributeError, KeyError):
-            raise InputError(f"over.{name}: unknown to a {type(system).__name__}") from None
-        new = value if entry is None else (*old[:entry], value, *old[entry + 1 :])
+        if base not in (names := _names(system)):
+            raise InputError(f"over.{name}: unknown to a {type(system).__name__}{nearest(base, names)}")
+        old = system[base] if isinstance(system, Mapping) else getattr(system, base)
+        if entry is not None:
+            value = _with_entry(old, entry, value, name)
+        elif not (isinstance(system, System) and system.parameter(base).is_number):
+            _check_number(old, name)
         if isinstance(system, Mapping):
-            system = {**system, base: new}
+            system = {**system, base: value}
         else:
-            system = eqx.tree_at(lambda s, base=base: getattr(s, base), system, new, is_leaf=lambda x: x is None)
+            system = eqx.tree_at(lambda s, base=base: getattr(s, base), system, value, is_leaf=lambda x: x is None)
     return system
+
+
+def _names(system: Any) -> list[str]:
+    """Names of the keys, fields or attributes of a pytree."""
+    if isinstance(system, Mapping):
+        return list(system)
+    if is_dataclass(system):
+        return [field.name for field in fields(system)]
+    return list(getattr(system, "_fields", getattr(system, "__dict__", ())))
+
+
+def _with_entry(old: Any, entry: int, value: Array, name: str) -> Any:
+    """``old``, an array, list or tuple, with one number replaced."""
+    base = entry_of(name)[0]
+    if not _is_listed(old):
+        raise InputError(f"over.{name}: {base} is not a list; allowed is {base}")
+    if entry >= len(old):
+        allowed = f"allowed is {base}[0] to {base}[{len(old) - 1}]" if len(old) else f"{base} is empty"
+        raise InputError(f"over.{name}: {allowed}")
+    _check_number(old[entry], name)
+    if isinstance(old, (list, tuple)):
+        return eqx.tree_at(lambda entries: entries[entry], old, value, is_leaf=lambda x: x is None)
+    return jnp.asarray(old, jnp.result_type(old, value)).at[entry].set(value)
+
+
+def _is_listed(value: Any) -> bool:
+    return isinstance(value, (list, tuple)) or getattr(value, "ndim", 0) > 0
+
+
+def _check_number(old: Any, name: str) -> None:
+    """Check that a number in the place of ``old`` keeps the structure of the pytree."""
+    listed = _is_listed(old)
+    if old is None or (jax.tree_util.all_leaves([old]) and not listed and not isinstance(old, str)):
+        return
+    kind = "an array" if hasattr(old, "ndim") else f"a {type(old).__name__}"
+    allowed = f'one entry, for example "{name}[0]"' if listed and name == entry_of(name)[0] else "a number"
+    raise InputError(f"over.{name}: {kind} cannot vary as a whole; allowed is {allowed}")
