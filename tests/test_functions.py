@@ -237,8 +237,16 @@ def test_any_function_is_swept_resumed_and_refused(tmp_path):
     before = out.stat().st_mtime_ns
     dt.sweep(one(1.0), pytree, over=over, out=out)
     assert out.stat().st_mtime_ns == before
-    with pytest.raises(dt.InputError, match="another scene"):
+    remedy = "differs?; --fresh replaces it \\(fresh=True in Python\\)"
+    with pytest.raises(
+        dt.InputError, match=f"another scene or version: the function, an option or a fixed value {remedy}"
+    ):
         dt.sweep(one(2.0), pytree, over=over, out=out)
+    with pytest.raises(dt.InputError, match=f"the values of over or the outputs {remedy}"):
+        dt.sweep(one(1.0), pytree, over={"a": [4.0], "b": [1.0]}, out=out)
+    with pytest.raises(dt.InputError, match="system = 'function': known only to the script"):
+        dt.sweep(dt.floquet, SHAFT, over={"beta": [0.1]}, out=out)
+    assert dt.sweep(one(2.0), pytree, over=over, out=out, fresh=True).root[1, 1] == 12.0
 
 
 @pytest.mark.parametrize("name", ["k[1]", "l[1]"])

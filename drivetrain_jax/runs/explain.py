@@ -14,7 +14,7 @@ from drivetrain_jax._wording import clipped, counted
 from drivetrain_jax.analysis.atlas.analysis import ANALYSIS
 from drivetrain_jax.runs.identity import scene_content
 from drivetrain_jax.runs.job import Job
-from drivetrain_jax.runs.scene import Scene, restore_scene
+from drivetrain_jax.runs.scene import Scene, is_of_function, restore_scene
 
 
 def differences(stored: Mapping[str, Any], job: Job) -> list[str]:
@@ -22,8 +22,13 @@ def differences(stored: Mapping[str, Any], job: Job) -> list[str]:
 
     ``stored`` holds the scene (TOML), the package version, ``numerics`` and ``numerics_detail``.
     """
+    text = stored.get("scene")
+    if is_of_function(text) and not job.scene.is_named:
+        same = "the values of over or the outputs differ"
+        own = same if text == job.scene.text else "the function, an option or a fixed value differs"
+        return list(_of_code(stored, job)) or [own]
     try:
-        scene = restore_scene(stored.get("scene"))
+        scene = restore_scene(text)
     except InputError as error:
         return [not_valid(error)]
     return differences_of(scene, stored, job)
@@ -39,12 +44,15 @@ def differences_of(scene: Scene, stored: Mapping[str, Any], job: Job, *, points:
 
     Without ``points``, axes and fixed values may differ, and the work may have more results than requested.
     """
-    found = list(_of_scenes(scene, job.scene, points))
+    return [*_of_scenes(scene, job.scene, points), *_of_code(stored, job)]
+
+
+def _of_code(stored: Mapping[str, Any], job: Job) -> Iterator[str]:
+    """Differences of the code, its packages and the machine."""
     if stored.get("drivetrain_jax_version") != drivetrain_jax.__version__:
-        found.append(f"drivetrain_jax is {drivetrain_jax.__version__}, was {stored.get('drivetrain_jax_version')}")
+        yield f"drivetrain_jax is {drivetrain_jax.__version__}, was {stored.get('drivetrain_jax_version')}"
     if stored.get("numerics") != job.numerics:
-        found += _of_numerics(stored.get("numerics_detail"), job.numerics_detail)
-    return found
+        yield from _of_numerics(stored.get("numerics_detail"), job.numerics_detail)
 
 
 def _of_scenes(theirs: Scene, ours: Scene, points: bool) -> Iterator[str]:

@@ -150,10 +150,11 @@ class OutputState:
     @property
     def remedy(self) -> str:
         """The remedy for the :attr:`obstacle`."""
+        replaces = "--fresh replaces it (fresh=True in Python)"
         if self._shared is None or self.parts.holds_work():
-            return "--fresh replaces it"
+            return replaces
         kept = f"--reuse {self.out.name} with another --out takes {ReusedPoints((self._shared,)).count} points from it"
-        return f"--fresh replaces it, {kept}"
+        return f"{replaces}, {kept}"
 
     def reused_points(self, reuse: Sequence[str | Path], fresh: bool) -> ReusedPoints:
         """The points that a run reuses from the results ``reuse`` and, unless it is ``fresh``, from the present result.

@@ -25,7 +25,7 @@ from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.analysis.request import checked
 from drivetrain_jax.runs.axes import Axis, entry_of
 from drivetrain_jax.runs.run import run
-from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.runs.scene import FUNCTION, Scene
 from drivetrain_jax.systems import Model, System, get_system, system_names
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ def sweep(
     over: Mapping[str, Any],
     out: str | Path | None = None,
     outputs: Sequence[str] | None = None,
+    *,
+    fresh: bool = False,
     **options: Any,
 ) -> xr.Dataset:
     """One labelled dataset with the results of ``function(system)`` on the outer product of ``over``.
@@ -55,6 +57,7 @@ def sweep(
             A value may be a text with a unit, ``"18 deg"``.
         out: a netCDF file. The next call resumes unfinished work, and only reads a finished result.
         outputs: variables to compute; default: the default of the analysis, or all.
+        fresh: compute all points again and replace what is at ``out``, such as the result of another function.
         options: options of the analysis, or keyword arguments of the function.
 
     Returns: a dataset with one dimension for each entry of ``over``, in that order. A point with a result that is not
@@ -76,8 +79,8 @@ def sweep(
     of_another_package = isinstance(function, analyses.AnalysisFunction)
     own = function.name if of_another_package else getattr(function, "__name__", "")
     if of_another_package or (own in analysis_names() and getattr(analyses, own, None) is function):
-        return run(_scene_table(own, system, over, outputs, options), out=out)
-    return run(_function_scene(function, system, over, outputs, options), out=out)
+        return run(_scene_table(own, system, over, outputs, options), out=out, fresh=fresh)
+    return run(_function_scene(function, system, over, outputs, options), out=out, fresh=fresh)
 
 
 def _scene_table(
@@ -211,7 +214,7 @@ def _kind(
 
     dimensions = tuple(Dimension(dim, f"number of the entry of {v.name}", ()) for v in variables for dim in v.dims)
     body = {
-        "name": "function",
+        "name": FUNCTION,
         "title": of.__name__,
         "parameters": (*described.values(), computing),
         "models": {name: Model(build, varies)},

@@ -27,6 +27,8 @@ from drivetrain_jax.systems import Model, System, get_system, system_names
 Value = float | int | str | tuple[float, ...]
 # Assumed length of a dimension that depends on the system.
 _USUAL_SIZE = 4
+# Name of the system that stands for a function in the scene of its sweep.
+FUNCTION = "function"
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +115,11 @@ class _SceneTable(msgspec.Struct, forbid_unknown_fields=True):
     options: dict[str, Any] = {}
 
 
+def is_of_function(text: object) -> bool:
+    """True if a scene of a swept function has this ``text``, a digest that does not restore the function."""
+    return str(text).startswith(f'system = "{FUNCTION}"\n')
+
+
 def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Scene:
     """Read and check a scene: a path, a name of `drivetrain list`, or a mapping with the same keys.
 
@@ -140,6 +147,8 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
 
 def restore_scene(text: object) -> Scene:
     """The scene whose TOML text a result stores. Raises :class:`InputError` if it is not valid now."""
+    if is_of_function(text):
+        raise InputError(f"system = {FUNCTION!r}: known only to the script that called drivetrain_jax.sweep")
     try:
         return load_scene(tomllib.loads(str(text)))
     except tomllib.TOMLDecodeError as error:
