@@ -23,7 +23,7 @@ from drivetrain_jax._wording import nearest, shown
 from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analysis_names
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.analysis.request import checked
-from drivetrain_jax.runs.axes import Axis, entry_of
+from drivetrain_jax.runs.axes import Axis, AxisTable, entry_of, spread
 from drivetrain_jax.runs.run import run
 from drivetrain_jax.runs.scene import FUNCTION, Scene
 from drivetrain_jax.systems import Model, System, get_system, system_names
@@ -143,11 +143,10 @@ def _function_scene(
     known = {p.name: p for p in system.parameters} if isinstance(system, System) else {}
     values = {}
     for name, given in over.items():
-        row, described = _row(name, given), known.get(entry_of(name)[0])
-        if described and any(isinstance(value, str) for value in row):
-            scalar = replace(described, name=name, listed=False, broadcast=False)
-            row = [checked(scalar, value, "over.") for value in row]
-        values[name] = np.array(_numbers(name, row))
+        described = known.get(entry_of(name)[0], Parameter(name, "1", name))
+        scalar = replace(described, name=name, listed=False, broadcast=False)
+        row = [checked(scalar, value, "over.") for value in _row(name, given)]
+        values[name] = spread(AxisTable(None, None, None, None, _numbers(name, row)), f"over.{name}")
     name = re.sub(r"\W", "_", getattr(function, "__name__", "function")).strip("_") or "value"
 
     def one(point: Mapping[str, Any]) -> dict[str, Array]:
