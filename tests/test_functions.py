@@ -203,6 +203,10 @@ def swept(function, over=None, **options):
         (lambda: swept(len, {"a": [0.0, 0.0, 1.0]}), "over.a: the value 0 occurs twice; allowed are distinct values"),
         (lambda: dt.sweep(len, TRIPOD, over={"element": ["input", "output"]}), "over.element: got .*; allowed are numbers"),
         (lambda: dt.sweep(len, SHAFT, over={"beta": [0.1, 2.0]}), "over.beta = 2.0: allowed is -1.57"),
+        (lambda: swept(lambda p: {"amp": p["a"]}, outputs="am"), r"'am' is not a result of lambda \(did you mean amp\?\)"),
+        (lambda: swept(lambda p: {"amp": p["a"]}, outputs=[]), r"outputs = \[\]: allowed is one or more of amp"),
+        (lambda: swept(lambda p: {"r": {"s": p["a"]}}), "returns a dict as 'r'; allowed is an array or a flat dict of"),
+        (lambda: swept(lambda p: None), "function: returns a NoneType; allowed is an array or a flat dict of arrays"),
         (lambda: swept(len, {"aa": [0.0, 1.0]}), r"over.aa: unknown to a dict \(did you mean a\?\); allowed is a, k, l"),
         (lambda: dt.sweep(len, SHAFT, over={"name": [1.0]}), "over.name: unknown to a Cardan.*; allowed is beta, Omega, "),
         (lambda: dt.sweep(abs, 1.0, over={"a": [0.0, 1.0]}), "system: got a float; allowed is a pytree"),
@@ -246,6 +250,7 @@ def test_any_function_is_swept_resumed_and_refused(tmp_path):
         dt.InputError, match=f"another scene or version: the function, an option or a fixed value {remedy}"
     ):
         dt.sweep(one(2.0), pytree, over=over, out=out)
+    assert dt.sweep(one(1.0), pytree, over=over, outputs="root").equals(found[["root", "outcome"]])
     with pytest.raises(dt.InputError, match=f"the values of over or the outputs {remedy}"):
         dt.sweep(one(1.0), pytree, over={"a": [4.0], "b": [1.0]}, out=out)
     with pytest.raises(dt.InputError, match="system = 'function': known only to the script"):

@@ -155,10 +155,7 @@ def _function_scene(
     example = {key: jax.ShapeDtypeStruct((), float) for key in values}
     traced, shapes = jax.make_jaxpr(one, return_shape=True)(example)
     _check_outcome(shapes)
-    wanted = [key for key in shapes if key != OUTCOME.name] if outputs is None else list(outputs)
-    for key in wanted:
-        if key not in shapes:
-            raise InputError(f"outputs: {key!r} is not a result of {name}; allowed is one of {', '.join(shapes)}")
+    wanted = _wanted(outputs, [key for key in shapes if key != OUTCOME.name], name)
     content = [re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr)), *(np.asarray(x).tobytes() for x in traced.consts)]
     computes = hashlib.blake2b(repr(content).encode(), digest_size=16).hexdigest()
     variables = tuple(_variable(key, shapes[key]) for key in wanted)
@@ -240,13 +237,26 @@ def _named(result: Any, name: str) -> dict[str, Array]:
     """The arrays of a result by name."""
     if isinstance(result, functions.Result):
         result = result.variables
-    if isinstance(result, Mapping):
-        return {str(key): jnp.asarray(value) for key, value in result.items()}
-    try:
-        return {name: jnp.asarray(result)}
-    except (TypeError, ValueError):
-        kind = type(result).__name__
-        raise InputError(f"function: returns a {kind}; allowed is an array or a dict of arrays") from None
+    named, found = result if isinstance(result, Mapping) else {name: result}, {}
+    for key, value in named.items():
+        try:
+            found[str(key)] = jnp.asarray(value)
+        except (TypeError, ValueError):
+            given = f"a {type(value).__name__}" + (f" as {key!r}" if named is result else "")
+            raise InputError(f"function: returns {given}; allowed is an array or a flat dict of arrays") from None
+    return found
+
+
+def _wanted(outputs: Sequence[str] | None, known: Sequence[str], name: str) -> list[str]:
+    """Names of the results to store; the outcome is always one."""
+    given = known if outputs is None else [outputs] if isinstance(outputs, str) else outputs
+    wanted = [key for key in given if key != OUTCOME.name]
+    for key in wanted:
+        if key not in known:
+            raise InputError(f"outputs: {key!r} is not a result of {name}{nearest(str(key), known)}")
+    if known and not wanted:
+        raise InputError(f"outputs = {shown(outputs)}: allowed is one or more of {', '.join(known)}")
+    return wanted
 
 
 def _check_outcome(shapes: Mapping[str, jax.ShapeDtypeStruct]) -> None:
