@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -76,6 +77,7 @@ def sweep(
     if not isinstance(over, Mapping) or not over:
         given = f" = {shown(over)}" if over else ": empty"
         raise InputError(f"over{given}; allowed are values by the name of a parameter")
+    _check_concrete(system, over, options)
     of_another_package = isinstance(function, analyses.AnalysisFunction)
     own = function.name if of_another_package else getattr(function, "__name__", "")
     if of_another_package or (own in analysis_names() and getattr(analyses, own, None) is function):
@@ -154,6 +156,7 @@ def _function_scene(
 
     example = {key: jax.ShapeDtypeStruct((), float) for key in values}
     traced, shapes = jax.make_jaxpr(one, return_shape=True)(example)
+    _check_concrete(traced.consts)
     _check_outcome(shapes)
     wanted = _wanted(outputs, [key for key in shapes if key != OUTCOME.name], name)
     content = [re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr)), *(np.asarray(x).tobytes() for x in traced.consts)]
@@ -257,6 +260,15 @@ def _wanted(outputs: Sequence[str] | None, known: Sequence[str], name: str) -> l
     if known and not wanted:
         raise InputError(f"outputs = {shown(outputs)}: allowed is one or more of {', '.join(known)}")
     return wanted
+
+
+def _check_concrete(*values: Any) -> None:
+    """Check that there are numbers for a file and a dataset."""
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values)):
+        raise InputError(
+            "sweep: does not work under jax.jit, jax.grad or jax.vmap; allowed are numbers outside of them, "
+            "or jax.vmap(function) in place of the sweep"
+        )
 
 
 def _check_outcome(shapes: Mapping[str, jax.ShapeDtypeStruct]) -> None:
