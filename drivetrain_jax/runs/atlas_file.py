@@ -333,8 +333,8 @@ class StoredAtlas:
     def _checked(self, name: str, values: Mapping[str, Any]) -> Any:
         try:
             numbers = np.asarray(values[name])
-        except ValueError:
-            # Rows of different lengths.
+        except (TypeError, ValueError):
+            # Numbers that jax traces, or rows of different lengths.
             numbers = np.empty(0, object)
         if numbers.dtype.kind not in "iuf":
             raise InputError(f"{name} = {shown(values[name])}: allowed are numbers")

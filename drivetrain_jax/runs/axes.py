@@ -134,7 +134,6 @@ def check_count(name: str, spec: AxisTable, continuous: bool) -> int:
             raise InputError(
                 f"{field}: values given together with start, stop, num or scale; allowed is one of the two"
                 f" ({field} = [...] replaces the whole axis)"
-                f" ({field} = [...] replaces the whole axis)"
             )
         if not spec.values:
             raise InputError(f"{field}.values = []: empty axis; allowed is one value or more")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -87,6 +88,11 @@ def test_wrong_units_and_other_fixed_values_are_refused(atlas, values, words):
     with pytest.raises(InputError) as error:
         atlas(**values)
     assert all(word in str(error.value) for word in words) and "\n" not in str(error.value)
+
+
+def test_traced_numbers_are_refused_in_one_line(atlas):
+    with pytest.raises(InputError, match=r"^omega = [^\n]*: allowed are numbers"):
+        jax.jit(lambda omega: atlas(omega=omega).spectral_radius.values)(1.1)
 
 
 def test_an_integer_is_no_range_of_an_atlas(monkeypatch):
