@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib.metadata import entry_points
-from typing import Any
+from typing import Any, TypeVar
+
+from drivetrain_jax._errors import InputError
+
+Found = TypeVar("Found")
 
 SYSTEMS, ANALYSES = "drivetrain_jax.systems", "drivetrain_jax.analyses"
 FIGURES, RULES = "drivetrain_jax.figures", "drivetrain_jax.rules"
@@ -33,3 +37,24 @@ def load_plugin(group: str, name: str, wanted: str, is_wanted: Callable[[Any], b
             raise ImportError(f"{entry.value} is named {found.name}, not {name}")
         return found
     return None
+
+
+def call_plugin(
+    group: str, name: str, what: str, function: Callable[..., Any], *arguments: Any, kind: type[Found], allowed: str
+) -> Found:
+    """``function(*arguments)``, a function of the entry point ``name``.
+
+    Raises ``InputError`` with one line that names the entry point if the function fails or returns no ``kind``.
+    """
+    entry = next((entry.value for entry in entry_points(group=group, name=name)), name)
+    try:
+        found = function(*arguments)
+    except (InputError, MemoryError):
+        raise
+    # Code of another package may raise anything.
+    except Exception as error:
+        text = " ".join(str(error).split())
+        raise InputError(f"{what} {entry} raised {type(error).__name__}: {text}; allowed is {allowed}") from error
+    if not isinstance(found, kind):
+        raise InputError(f"{what} {entry} returned {type(found).__name__}; allowed is {allowed}")
+    return found

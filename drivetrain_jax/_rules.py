@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
+from drivetrain_jax._wording import shown
+
 # Relative tolerance for the rounding of a formula evaluated in another order.
 ROUNDING = 1e-9
 
@@ -20,6 +22,10 @@ class Rule:
     text: str
     variables: tuple[str, ...]
     broken: Callable[[xr.Dataset], xr.DataArray]
+
+    def __post_init__(self) -> None:
+        if isinstance(self.variables, str):
+            raise TypeError(f"variables = {self.variables!r}: allowed is a tuple of names, ({self.variables!r},)")
 
 
 def within(name: str, lower: float = -np.inf, upper: float = np.inf) -> Rule:
@@ -89,3 +95,7 @@ class Declared:
     gaps: tuple[str, ...] = ()
     kept: tuple[str, ...] = ()
     has_points: bool = True
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.rules, tuple) or not all(isinstance(rule, Rule) for rule in self.rules):
+            raise TypeError(f"rules: got {shown(self.rules)}; allowed is a tuple of rules, (rule, ...)")

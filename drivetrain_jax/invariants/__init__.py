@@ -7,14 +7,15 @@ Other packages add rules of their analyses through the entry point group ``drive
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from importlib import import_module
 
 import numpy as np
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._plugins import RULES, load_plugin
+from drivetrain_jax._plugins import RULES, call_plugin, load_plugin
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax._rules import Declared, Rule, within
 
@@ -137,4 +138,13 @@ def declared(analysis: str) -> Declared:
         found = load_plugin(RULES, analysis, "the rules of an analysis", lambda x: isinstance(x, Declared))
     except ImportError as error:
         raise InputError(f"analysis = {analysis!r}: {' '.join(str(error).split())}") from error
-    return Declared() if found is None else found
+    if found is None:
+        return Declared()
+    return replace(found, rules=tuple(_of_plugin(rule, analysis) for rule in found.rules))
+
+
+def _of_plugin(rule: Rule, analysis: str) -> Rule:
+    """``rule`` with errors that name the entry point of ``analysis``."""
+    what, allowed = f"rule {rule.text!r} of", "a DataArray of booleans"
+    broken = partial(call_plugin, RULES, analysis, what, rule.broken, kind=xr.DataArray, allowed=allowed)
+    return replace(rule, broken=broken)

@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._plugins import FIGURES, load_plugin, plugin_names
+from drivetrain_jax._plugins import FIGURES, call_plugin, load_plugin, plugin_names
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -69,4 +69,8 @@ def _plot_of_plugin(analysis: str, dataset: xr.Dataset, *others: xr.Dataset) -> 
     if found is None:
         known = ", ".join((*_DRAWN, *plugin_names(FIGURES)))
         raise InputError(f"analysis = {analysis!r}: has no figure; allowed is one of {known}")
-    return found(dataset, *others)
+    # Local import: matplotlib takes long, and results without a figure need none.
+    from matplotlib.figure import Figure
+
+    allowed = "a matplotlib Figure"
+    return call_plugin(FIGURES, analysis, "figure", found, dataset, *others, kind=Figure, allowed=allowed)

@@ -435,15 +435,29 @@ def test_titles_that_an_output_cannot_write_are_escaped(folder):
     assert r"sweeps/one.toml  Gelenk f\xfcr \u03b2" in done.stdout and done.stderr == ""
 
 
-def test_a_package_that_fails_spoils_no_other_system(cli, tmp_path, monkeypatch):
-    info = tmp_path / "site" / "broken-1.dist-info"
-    info.mkdir(parents=True)
-    (info.parent / "broken_shafts.py").write_text("from drivetrain_jax.systems.cardan import Cardan\n1 / 0\n")
-    (info.parent / "renamed_shafts.py").write_text("from drivetrain_jax.systems.cardan import Cardan\n")
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1\n")
-    entries = "[drivetrain_jax.systems]\nbroken = broken_shafts:Cardan\nrenamed = renamed_shafts:Cardan\n"
-    (info / "entry_points.txt").write_text(entries)
-    monkeypatch.syspath_prepend(str(info.parent))
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """A function that installs a package of modules and entry points by group."""
+
+    def install(modules, **entries):
+        info = tmp_path / "site" / "other-1.dist-info"
+        info.mkdir(parents=True)
+        for name, code in modules.items():
+            (info.parent / f"{name}.py").write_text(code)
+        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1\n")
+        groups = [f"[drivetrain_jax.{group}]\n" + "\n".join(lines) for group, lines in entries.items()]
+        (info / "entry_points.txt").write_text("\n".join(groups) + "\n")
+        monkeypatch.syspath_prepend(str(info.parent))
+
+    yield install
+    for name in [n for n, m in sys.modules.items() if str(tmp_path) in str(getattr(m, "__file__", ""))]:
+        del sys.modules[name]
+
+
+def test_a_package_that_fails_spoils_no_other_system(cli, install):
+    code = "from drivetrain_jax.systems.cardan import Cardan\n"
+    entries = ["broken = broken_shafts:Cardan", "renamed = renamed_shafts:Cardan"]
+    install({"broken_shafts": f"{code}1 / 0\n", "renamed_shafts": code}, systems=entries)
     code, out, _ = cli("list")
     fails = "broken_shafts:Cardan cannot be loaded: ZeroDivisionError: division by zero"
     assert code == 0 and "cardan     Cardan" in out and f"broken     {fails}" in out
@@ -452,17 +466,37 @@ def test_a_package_that_fails_spoils_no_other_system(cli, tmp_path, monkeypatch)
     assert (code, err) == (2, [f"drivetrain: system = 'broken': {fails}"])
 
 
-def test_an_analysis_that_fails_spoils_no_other_one(cli, tmp_path, monkeypatch):
-    info = tmp_path / "site" / "unsound-1.dist-info"
-    info.mkdir(parents=True)
-    (info.parent / "unsound_analysis.py").write_text("1 / 0\n")
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: unsound\nVersion: 1\n")
-    (info / "entry_points.txt").write_text("[drivetrain_jax.analyses]\nunsound = unsound_analysis:ANALYSIS\n")
-    monkeypatch.syspath_prepend(str(info.parent))
+def test_an_analysis_that_fails_spoils_no_other_one(cli, install):
+    install({"unsound_analysis": "1 / 0\n"}, analyses=["unsound = unsound_analysis:ANALYSIS"])
     assert "Analysis floquet" in cli("list", "cardan")[1]
     code, _, err = cli("point", "cardan", "unsound", "beta=0.1")
     fails = "unsound_analysis:ANALYSIS cannot be loaded: ZeroDivisionError: division by zero"
     assert (code, err) == (2, [f"drivetrain: analysis = 'unsound': {fails}"])
+
+
+_RULES = "from drivetrain_jax.invariants import Declared, Rule\n"
+
+
+@pytest.mark.parametrize(
+    ("group", "code", "wanted"),
+    [
+        ("figures", "def X(ds): pass", "figure bad:X returned NoneType; allowed is a matplotlib Figure"),
+        ("figures", "def X(ds): ds['q']", "figure bad:X raised KeyError: "),
+        ("rules", f"{_RULES}X = Declared((Rule('q > 0', (), lambda ds: ds['q']),))", "rule 'q > 0' of bad:X raised Key"),
+        ("rules", f"{_RULES}X = Declared((Rule('r', (), lambda ds: 1),))", "rule 'r' of bad:X returned int; allowed is "),
+        ("rules", f"{_RULES}X = Declared((Rule('r', 'q', len),))", "variables = 'q': allowed is a tuple of names, ('q',)"),
+        ("rules", f"{_RULES}X = Declared(Rule('r', (), len))", "bad:X cannot be loaded: TypeError: rules: got Rule"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("foreign", [False, True])
+def test_a_figure_or_rule_that_fails_is_named(cli, install, group, code, wanted, foreign):
+    install({"bad": code}, **{group: ["toy = bad:X"]})
+    cli("run", "scene.toml", "--out", "r.nc", "--quiet")
+    if foreign:
+        os.utime("r.nc")
+    command = ("plot", "r.nc", "--out", "f.png") if group == "figures" else ("verify", "r.nc")
+    code, _, err = cli(*command)
+    assert (code, len(err)) == (2, 1) and wanted in err[0]
 
 
 def test_list_shows_the_scenes_of_this_folder(cli, folder):
