@@ -25,10 +25,10 @@ from drivetrain_jax import _compile_cache
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._printing import printed
 from drivetrain_jax._wording import did_you_mean
-from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analyses_of, get_analysis
+from drivetrain_jax.analysis import OUTCOME, Analysis, Dimension, Outcome, Request, Solver, analyses_of, get_analysis
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
 from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lanes_last, path_entry
-from drivetrain_jax.analysis.request import make_request
+from drivetrain_jax.analysis.request import checked_solvers, dimensions_of, make_request
 from drivetrain_jax.systems import System
 
 # Lanes of similar effort that are solved together.
@@ -83,6 +83,7 @@ class _Job:
     constants: Constants
     path: bool
     single: bool
+    dimensions: tuple[Dimension, ...]
 
     def __hash__(self) -> int:
         return hash((self.analysis.name, self.system, self.request.outputs, self.request.method, self.constants))
@@ -90,7 +91,7 @@ class _Job:
     @property
     def solvers(self) -> tuple[Solver, ...]:
         """All solvers that a call can choose from."""
-        return self.analysis.solvers(self.system, self.request)
+        return checked_solvers(self.analysis, self.system, self.request, self.dimensions)
 
     def own_dims(self, name: str) -> int:
         """Number of dimensions that the result ``name`` has at one point."""
@@ -128,7 +129,7 @@ def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapp
         request = make_request(type(system), analysis, [outputs] if isinstance(outputs, str) else outputs, options)
         if model.check:
             model.check(values)
-        analysis.dimensions(type(system), request, values)
+        dimensions = dimensions_of(analysis, type(system), request, values)
     except ValueError as error:
         # Without a scene the names of its tables mean nothing to the caller.
         raise InputError(re.sub(r"^(fixed|options)\.", "", str(error))) from None
@@ -139,7 +140,7 @@ def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapp
     _check_scalars(name, parameters)
     rest = jax.tree.map(lambda x: x if isinstance(x, str) else path if x is leaf else None, values)
     single = along is not None and np.ndim(leaf) == 0  # pyright: ignore[reportArgumentType]
-    return _Job(analysis, type(system), request, Constants(rest), along is not None, single), parameters
+    return _Job(analysis, type(system), request, Constants(rest), along is not None, single, dimensions), parameters
 
 
 def _check_scalars(name: str, parameters: Any) -> None:

@@ -1,14 +1,18 @@
-"""Check outputs, method and options against those that the analysis and the system offer."""
+"""Check outputs, method and options against those that the analysis and the system offer, and what its solvers return."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import dataclass, replace
 from typing import Any
 
+import jax.numpy as jnp
+from jax import Array
+
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._quantities import Parameter
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax._wording import did_you_mean, nearest, shown
-from drivetrain_jax.analysis._base import OUTCOME, Analysis, Request
+from drivetrain_jax.analysis._base import OUTCOME, Analysis, Request, Solver
 from drivetrain_jax.systems import System
 
 
@@ -45,6 +49,74 @@ def make_request(
             allowed = ", ".join(other for other in known if other not in lacking)
             raise InputError(f"{field} = {name!r}: {lacking[name]}; allowed is {allowed}")
     return request
+
+
+def dimensions_of(
+    analysis: Analysis, system: type[System], request: Request, fixed: Mapping[str, Any]
+) -> tuple[Dimension, ...]:
+    """The dimensions of the results; :class:`InputError` if a requested result has another one."""
+    found = analysis.dimensions(system, request, fixed)
+    known = [each.name for each in found]
+    for name in request.outputs:
+        for dim in analysis.variable(name).dims:
+            if dim not in known:
+                raise InputError(f"analysis {analysis.name}: {name} has the dimension {dim!r}{nearest(dim, known)}")
+    return found
+
+
+def checked_solvers(
+    analysis: Analysis, system: type[System], request: Request, dimensions: Sequence[Dimension]
+) -> tuple[Solver, ...]:
+    """The solvers of ``request``. Wrong results of a solver raise :class:`InputError` when they are traced."""
+    path = analysis.path_axis(system, request) is not None
+    sizes = {each.name: len(each.values) for each in dimensions}
+    return tuple(
+        replace(each, solve=_CheckedSolve(analysis, request, path, sizes, each.solve))
+        for each in analysis.solvers(system, request)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _CheckedSolve:
+    """``solve`` of a solver, which returns the requested results and no others; ``sizes`` with 0 are unknown."""
+
+    analysis: Analysis
+    request: Request
+    path: bool
+    sizes: Mapping[str, int]
+    solve: Callable[[Mapping[str, Any], Array], dict[str, Array]]
+
+    def __call__(self, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+        found: Any = self.solve(values, effort)
+        wanted = (*(self.analysis.variable(name) for name in self.request.outputs), OUTCOME)
+        names = [variable.name for variable in wanted]
+        if not isinstance(found, Mapping):
+            raise self._error(f"solve returned {type(found).__name__}; allowed is a dict of {', '.join(names)}")
+        declared = [*(variable.name for variable in self.analysis.variables), OUTCOME.name]
+        for name in found:
+            if name not in declared:
+                raise self._error(f"solve returned {name!r}, which is not declared{nearest(str(name), declared)}")
+        for name in names:
+            if name not in found:
+                raise self._error(f"solve returned {', '.join(found)}, not {name}; allowed is {', '.join(names)}")
+        return {variable.name: self._checked(variable, found[variable.name]) for variable in wanted}
+
+    def _checked(self, variable: Variable, value: Any) -> Array:
+        dims = [*(["path"] if self.path else []), *variable.dims]
+        sizes = [self.sizes.get(dim, 0) for dim in dims]
+        text = ", ".join([*(f"{dim} = {n}" if n else dim for dim, n in zip(dims, sizes, strict=True)), "lanes"])
+        try:
+            array = jnp.asarray(value)
+        except (TypeError, ValueError):
+            kind = type(value).__name__
+            raise self._error(f"{variable.name} is of type {kind}; allowed is an array ({text})") from None
+        fits = all(size in {0, length} for size, length in zip(sizes, array.shape, strict=False))
+        if not fits or array.ndim - len(dims) not in {0, 1}:
+            raise self._error(f"{variable.name} has the shape {array.shape}; allowed is ({text})")
+        return array
+
+    def _error(self, text: str) -> InputError:
+        return InputError(f"analysis {self.analysis.name}: {text}")
 
 
 def _method_and_options(

@@ -154,7 +154,7 @@ def dimension_sizes(scene: Scene, grid: Grid) -> dict[str, int]:
         # Local import: `kernel` imports jax and this module.
         from drivetrain_jax.runs.kernel import result_shapes
 
-        shapes = result_shapes(scene, grid, scene.analysis.solvers(scene.system, scene.request)[0])
+        shapes = result_shapes(scene, grid, scene.solvers[0])
         for variable in variables:
             sizes |= zip(reversed(variable.dims), reversed(shapes[variable.name]), strict=False)
     return sizes

@@ -106,8 +106,7 @@ class Job:
         # Before the first kernel, which the plan may need.
         _check_double_precision()
         _compile_cache.enable(short=True)
-        solvers = self.problem.analysis.solvers(self.problem.system, self.problem.request)
-        return tuple(map(for_device, solvers))
+        return tuple(map(for_device, self.problem.solvers))
 
     @property
     def scene(self) -> Scene:
@@ -205,6 +204,9 @@ class Job:
         try:
             kernel = self._kernels[chunk.solver, chunk.size].result()
             return kernel(self.grid.columns(chunk.points), self.grid.numbers, chunk.effort)
+        except InputError as error:
+            # The error of a model or of an analysis, the same for all chunks.
+            raise ChunkError(str(error)) from error
         except Exception as error:
             solver = self.solvers[chunk.solver].name
             kind = RetryableError if _is_retryable(error) else ChunkError

@@ -16,8 +16,8 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax._wording import did_you_mean, nearest, shown
-from drivetrain_jax.analysis import OUTCOME, Analysis, Request, analyses_of, get_analysis
-from drivetrain_jax.analysis.request import checked, make_request
+from drivetrain_jax.analysis import OUTCOME, Analysis, Request, Solver, analyses_of, get_analysis
+from drivetrain_jax.analysis.request import checked, checked_solvers, dimensions_of, make_request
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.axes import Axis
 from drivetrain_jax.runs.physical import described, with_parameters
@@ -50,7 +50,12 @@ class Problem:
     @cached_property
     def dimensions(self) -> tuple[Dimension, ...]:
         """Dimensions of the results besides those of the sweep."""
-        return self.analysis.dimensions(self.system, self.request, self.fixed)
+        return dimensions_of(self.analysis, self.system, self.request, self.fixed)
+
+    @property
+    def solvers(self) -> tuple[Solver, ...]:
+        """The solvers of the requested method."""
+        return checked_solvers(self.analysis, self.system, self.request, self.dimensions)
 
     @cached_property
     def path_axis(self) -> str | None:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -19,6 +20,8 @@ import xarray as xr
 from interrupts import stop_after
 
 import drivetrain_jax as dt
+from drivetrain_jax.analysis import Dimension, Solver
+from drivetrain_jax.functions import analyse
 from drivetrain_jax.runs import toml, work
 from drivetrain_jax.runs.cluster import Cluster
 from drivetrain_jax.runs.executor import Threads
@@ -386,6 +389,36 @@ def test_failing_chunk_leaves_a_resumable_run(tmp_path):
     assert status(scene, tmp_path / "r.nc").state == "partial" and not (tmp_path / "r.nc").exists()
     with pytest.raises(Incomplete, match="chunk 0"):
         dt.run(scene)
+
+
+GOOD = {"wave": np.ones(3), "outcome": 0}
+
+
+@pytest.mark.parametrize(
+    ("found", "dim", "message"),
+    [
+        (None, "part", "solve returned NoneType; allowed is a dict of wave, outcome"),
+        ({"outcome": 0}, "part", "solve returned outcome, not wave; allowed is wave, outcome"),
+        ({"wave": np.ones(3)}, "part", "solve returned wave, not outcome; allowed is wave, outcome"),
+        (GOOD | {"vave": 1}, "part", "solve returned 'vave', which is not declared (did you mean wave?); allowed is "),
+        (GOOD | {"wave": np.ones(4)}, "part", "wave has the shape (4,); allowed is (part = 3, lanes)"),
+        (GOOD | {"wave": 1.0}, "part", "wave has the shape (); allowed is (part = 3, lanes)"),
+        (GOOD | {"wave": None}, "part", "wave is of type NoneType; allowed is an array (part = 3, lanes)"),
+        (GOOD, "parts", "wave has the dimension 'part' (did you mean parts?); allowed is parts"),
+    ],
+)
+@pytest.mark.parametrize("into", ["scene", "function"])
+def test_wrong_results_of_an_analysis_are_one_line(monkeypatch, found, dim, message, into):
+    solvers, labels = (Solver("fixed", lambda *_: found),), (Dimension(dim, "part of the wave", (1, 2, 3)),)
+    wrong = replace(toy.ANALYSES["toy"], solvers=lambda *_: solvers, dimensions=lambda *_: labels)
+    monkeypatch.setitem(toy.ANALYSES, "toy", wrong)
+    monkeypatch.setattr("drivetrain_jax.functions.get_analysis", lambda _: wrong)
+    with pytest.raises((Incomplete, dt.InputError)) as raised:
+        if into == "scene":
+            dt.run({"system": "toy", "analysis": "toy", "outputs": ["wave"], "fixed": {"a": 1.0}})
+        else:
+            analyse("toy", toy.Toy(a=1.0, unused=0.0), ["wave"], {})
+    assert str(raised.value).startswith(f"analysis toy: {message}") and "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(
