@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._plugins import ANALYSES, load_plugin, plugin_names
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax._wording import nearest
 
 if TYPE_CHECKING:
     from drivetrain_jax.analysis._base import OUTCOME, RTOL, Analysis, Outcome, Request, Solver
@@ -71,6 +72,8 @@ def get_analysis(name: str) -> Analysis:
     found = load_plugin(ANALYSES, name, "an analysis", lambda x: isinstance(x, Analysis))
     if found is None:
         raise KeyError(f"analysis = {name!r}: allowed is one of {', '.join(analysis_names())}")
+    if found.uses and found.uses not in analysis_names():
+        raise ImportError(f"uses = {found.uses!r}: no analysis{nearest(found.uses, analysis_names())}")
     return found
 
 
@@ -81,7 +84,18 @@ def analyses_of(system: type[System]) -> tuple[str, ...]:
         try:
             uses = get_analysis(name).uses
         except ImportError:
-            # Skip a package that fails to import; get_analysis reports its error.
+            # Skip a package that fails to import; `broken_analyses` reports its error.
             continue
         served |= dict.fromkeys([name] if uses in system.models else [])
     return tuple(served)
+
+
+def broken_analyses() -> dict[str, str]:
+    """The reasons why analyses of installed packages cannot be used, by name."""
+    found = {}
+    for name in plugin_names(ANALYSES):
+        try:
+            get_analysis(name)
+        except ImportError as error:
+            found[name] = " ".join(str(error).split())
+    return found

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter, Variable
-from drivetrain_jax._wording import aligned, written
-from drivetrain_jax.analysis import analyses_of, get_analysis
+from drivetrain_jax._wording import aligned, did_you_mean, nearest, written
+from drivetrain_jax.analysis import analyses_of, analysis_names, broken_analyses, get_analysis
 from drivetrain_jax.runs import shipped
 from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.runs.toml import entries
@@ -18,7 +18,7 @@ from drivetrain_jax.systems import System, system_names
 def overview() -> str:
     """Systems with their analyses, and the scenes found here."""
     lines = ["Systems (drivetrain list SYSTEM describes one)", *aligned([_system_row(name) for name in system_names()])]
-    return "\n".join([*lines, *_scene_lines(None)]) + "\n"
+    return "\n".join([*lines, *_broken_lines(), *_scene_lines(None)]) + "\n"
 
 
 def _system_row(name: str) -> tuple[str, str]:
@@ -26,7 +26,15 @@ def _system_row(name: str) -> tuple[str, str]:
         system = find_system(name)
     except InputError as error:
         return name, str(error).partition(": ")[2]
-    return name, f"{system.title}; analyses: {', '.join(analyses_of(system))}"
+    known = analysis_names()
+    served = [each if each in known else f"{each}: unknown{did_you_mean(each, known)}" for each in analyses_of(system)]
+    return name, f"{system.title}; analyses: {', '.join(served)}"
+
+
+def _broken_lines() -> list[str]:
+    """Analyses of installed packages that cannot be used, with the reason."""
+    broken = broken_analyses()
+    return ["", "Analyses that cannot be used", *aligned([*broken.items()])] if broken else []
 
 
 def describe(name: str) -> str:
@@ -43,11 +51,16 @@ def describe(name: str) -> str:
         lines += aligned([(preset, ", ".join(entries(values))) for preset, values in system.presets.items()])
     for analysis in analyses_of(system):
         lines += ["", *_analysis_lines(analysis, system)]
-    return "\n".join([*lines, *_scene_lines(system)]) + "\n"
+    return "\n".join([*lines, *_broken_lines(), *_scene_lines(system)]) + "\n"
 
 
 def _analysis_lines(name: str, system: type[System]) -> list[str]:
-    analysis = get_analysis(name).for_system(system)
+    try:
+        analysis = get_analysis(name).for_system(system)
+    except KeyError:
+        return [f"Analysis {name}: unknown{nearest(name, analysis_names())}"]
+    except ImportError as error:
+        return [f"Analysis {name}: {' '.join(str(error).split())}"]
     lacking = analysis.lacks(system)
     lines = [f"Analysis {name}: {analysis.title}"]
     lines += aligned(

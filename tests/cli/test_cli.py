@@ -467,10 +467,26 @@ def test_a_package_that_fails_spoils_no_other_system(cli, install):
 
 
 def test_an_analysis_that_fails_spoils_no_other_one(cli, install):
-    install({"unsound_analysis": "1 / 0\n"}, analyses=["unsound = unsound_analysis:ANALYSIS"])
-    assert "Analysis floquet" in cli("list", "cardan")[1]
-    code, _, err = cli("point", "cardan", "unsound", "beta=0.1")
+    copies = (
+        "from dataclasses import replace\nfrom drivetrain_jax.analysis import get_analysis\n"
+        "NAMED = get_analysis('modes')\nUSER = replace(NAMED, name='user', uses='floqet')\n"
+        "from drivetrain_jax.systems import System, serves\n"
+        "class Own(System):\n    name = title = 'own'\n    @serves('modos', 'unsound')\n    def model(self): pass\n"
+    )
+    entries = ["unsound = unsound_analysis:ANALYSIS", "named = copies:NAMED", "user = copies:USER"]
+    modules = {"unsound_analysis": "1 / 0\n", "copies": copies}
+    install(modules, analyses=entries, systems=["own = copies:Own"])
     fails = "unsound_analysis:ANALYSIS cannot be loaded: ZeroDivisionError: division by zero"
+    listed, system, own = cli("list")[1], cli("list", "cardan")[1], cli("list", "own")[1]
+    for line in (
+        "  named    copies:NAMED is named modes, not named\n",
+        f"  unsound  {fails}\n",
+        "  user     uses = 'floqet': no analysis (did you mean floquet?); allowed is floquet, ",
+    ):
+        assert line in listed and line in system and line in own
+    assert "Analysis floquet" in system and "own; analyses: modos: unknown (did you mean modes?), unsound" in listed
+    assert "Analysis modos: unknown (did you mean modes?); allowed is" in own and f"Analysis unsound: {fails}" in own
+    code, _, err = cli("point", "cardan", "unsound", "beta=0.1")
     assert (code, err) == (2, [f"drivetrain: analysis = 'unsound': {fails}"])
 
 
