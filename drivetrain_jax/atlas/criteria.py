@@ -39,11 +39,12 @@ _BLOCKS = (64, 512, 4096)
 
 
 def has_boundaries(atlas: Atlas, system: type[System]) -> bool:
-    """True if ``atlas`` has panels, and the system four states with a reversor that exchanges their halves."""
+    """True if ``atlas`` has panels, and the system four states, a reversor of their halves and ``log_determinant``."""
     if not atlas.panels:
         return False
     corner = {**atlas.fixed, **dict(zip(atlas.parameters, atlas.lower, strict=True))}
-    return system.models["floquet"].build(corner).reduced.exchanges_halves
+    form = system.models["floquet"].build(corner).reduced
+    return form.exchanges_halves and form.log_determinant is not None
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class Criteria:
         if not has_boundaries(self.atlas, self.system):
             raise InputError(
                 f"system = {self.system.name!r}: has no boundary functions; allowed for boundaries "
-                "and design answers is one of four states with a half-period propagator"
+                "and design answers is one of four states with a half-period propagator and log_determinant"
             )
 
     @classmethod
