@@ -14,7 +14,7 @@ from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax._wording import nearest
 
 if TYPE_CHECKING:
-    from drivetrain_jax.analysis._base import OUTCOME, RTOL, Analysis, Outcome, Request, Solver
+    from drivetrain_jax.analysis._base import OUTCOME, RTOL, Analysis, Outcome, Request, Solver, forward_derivatives
     from drivetrain_jax.analysis.numerics.lanes import over_lanes
     from drivetrain_jax.systems import System
 
@@ -46,6 +46,7 @@ __all__ = [
     "Variable",
     "analyses_of",
     "analysis_names",
+    "forward_derivatives",
     "get_analysis",
     "over_lanes",
 ]

@@ -1,7 +1,7 @@
 """Rules that every result must obey, checked from the file alone, without solving equations or importing jax.
 
 Other packages add rules of their analyses through the entry point group ``drivetrain_jax.rules``; each entry point names a
-:class:`~drivetrain_jax._rules.Declared`. An analysis without rules has only the general ones.
+:class:`Declared`. An analysis without rules has only the general ones.
 """
 
 from __future__ import annotations
@@ -17,9 +17,21 @@ import xarray as xr
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._plugins import RULES, call_plugin, load_plugin
 from drivetrain_jax._quantities import FIRST_FAILURE
-from drivetrain_jax._rules import Declared, Rule, within
+from drivetrain_jax._rules import Declared, Rule, in_order, multiple, ordered, relation, sums_to_one, within
 
-__all__ = ["Finding", "check", "declared"]
+__all__ = [
+    "Declared",
+    "Finding",
+    "Rule",
+    "check",
+    "declared",
+    "in_order",
+    "multiple",
+    "ordered",
+    "relation",
+    "sums_to_one",
+    "within",
+]
 
 # Analyses with rules, analysis/NAME/rules.py.
 _BUILT_IN = (

@@ -21,7 +21,7 @@ SYSTEMS = [f"systems/{name}.md" for name in ("bicardan", "cardan", "planetary", 
         ("jax.md", 15),
         ("notebooks.md", 25),
         ("scaling.md", 2),
-        ("extending.md", 7),
+        ("extending.md", 20),
         *(pytest.param(page, 2, marks=pytest.mark.full) for page in SYSTEMS),
     ],
 )
