@@ -98,6 +98,23 @@ def factor(unit: str, units: str) -> float:
     return short if math.isclose(short, exact, rel_tol=1e-15) else exact
 
 
+@cache
+def _words() -> tuple[frozenset[str], str]:
+    """The names of all units, and a pattern of their prefixes."""
+    names = [re.split(r"\s*=\s*", line) for line in _UNITS]
+    names = [[name, *others] for name, _, *others in names]
+    prefixes = [name[:-1] for line in names for name in line if name.endswith("-")]
+    return frozenset(name for line in names for name in line if not name.endswith("-")), "|".join(prefixes)
+
+
+@lru_cache(maxsize=256)
+def is_unit(units: str) -> bool:
+    """True if every word of ``units`` names a unit; pint is not needed."""
+    names, prefixes = _words()
+    words = re.findall(r"[^\W\d_]+|[°%]", units)
+    return all(word in names or re.sub(f"^({prefixes})", "", word) in names or word == "%" for word in words)
+
+
 def _parsed(unit: str) -> Any:
     spelt = unit
     for pattern, plain in _SPELLINGS:

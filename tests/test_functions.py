@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import diffrax
 import jax
@@ -22,7 +23,7 @@ from drivetrain_jax.runs import kernel
 from drivetrain_jax.runs.kernel import compile_kernel, result_variables
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
-from drivetrain_jax.systems import get_system
+from drivetrain_jax.systems import Smoothness, System, get_system, parameter, serves
 from tests.sizes import but_full
 
 BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
@@ -175,9 +176,21 @@ def swept(function, over=None, **options):
     )
 
 
+def declared(units="1", roles=(), model=None, **serving):
+    """A new system with the parameter ``omega``."""
+    own = {"name": "own", "title": "own", "__annotations__": {"omega": float}, "roles": dict(roles)}
+    build = serves("floquet", **serving)(lambda self: model)
+    return type("Own", (System,), own | {"omega": parameter(units, "speed"), "build": build})
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
+        (lambda: declared(units="N/furlong"), "Own.omega: units = 'N/furlong'; allowed is 1 or units such as"),
+        (lambda: declared(roles={"speed": "omeg"}), r"Own: roles\['speed'\]: 'omeg' is not a parameter "),
+        (lambda: declared(smooth=Smoothness({"kk": None})), "Own: smooth of floquet: 'kk' is not a parameter"),
+        (lambda: declared(parameters=("om",)), "Own: parameters of floquet: 'om' is not a parameter"),
+        (lambda: replace(get_analysis("modes"), methods={"m": ("zz",)}), r"methods\['m'\] of analysis modes: 'zz' is not"),
         (lambda: dt.Cardan(beta=17, Omega=1.4, **BASE), "beta = 17: allowed is -1.57"),
         (lambda: dt.Cardan(beta=0.1, Omega=1.4), "zeta: missing; allowed is 0 <= zeta"),
         (lambda: dt.Cardan(beta=np.array([0.1, 2.0]), Omega=1.4, **BASE), "beta = 2.0: allowed is"),

@@ -14,7 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE, Dimension, Parameter, Variable
+from drivetrain_jax._wording import nearest
 from drivetrain_jax.systems import Model, System
 
 
@@ -170,6 +172,14 @@ class Analysis:
     uses: str = ""
     patience: str = ""
     undecided: str = ""
+
+    def __post_init__(self) -> None:
+        known = [option.name for option in self.options]
+        for method, names in self.methods.items():
+            for name in names:
+                if name not in known:
+                    where = f"methods[{method!r}] of analysis {self.name}"
+                    raise InputError(f"{where}: {name!r} is not an option{nearest(name, known)}")
 
     def advice(self, request: Request) -> str:
         """Advice on an undecided verdict, as text; empty without one."""

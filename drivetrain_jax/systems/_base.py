@@ -26,7 +26,8 @@ from jax import Array
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._printing import printed
 from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
-from drivetrain_jax._wording import meant
+from drivetrain_jax._units import is_unit
+from drivetrain_jax._wording import meant, nearest
 from drivetrain_jax.resonances import Resonances, Values
 from drivetrain_jax.systems._physical import PhysicalData
 from drivetrain_jax.systems._smooth import Smoothness
@@ -142,6 +143,7 @@ class System(eqx.Module):
         cls.parameters += tuple(replace(m[_PARAMETER], name=name) for name, m in fields.items() if _PARAMETER in m)
         if "models" not in own:
             cls.models = dict(cls.models) | {a: m for method in own.values() for a, m in _models(cls, method).items()}
+        _check_names(cls)
         if "atlas" in cls.models and "floquet" not in cls.models:
             raise ValueError(f"models of {cls.name}: atlas needs floquet as well")
         for analysis in {"history", "forced"} & cls.models.keys():
@@ -214,6 +216,24 @@ class System(eqx.Module):
     def parameter(cls, name: str) -> Parameter:
         """The parameter called ``name``; ``KeyError`` if there is none."""
         return {p.name: p for p in cls.parameters}[name]
+
+
+def _check_names(system: type[System]) -> None:
+    """Raise :class:`~drivetrain_jax.InputError` for units that are none, and for names that are no parameters."""
+    names = [each.name for each in system.parameters]
+    for each in (*system.parameters, *(system.physical.quantities if system.physical else ())):
+        if not is_unit(each.units):
+            raise InputError(
+                f"{system.__name__}.{each.name}: units = {each.units!r}; allowed is 1 or units such as N m/rad"
+            )
+    named = {f"roles[{role!r}]": [name] for role, name in system.roles.items()}
+    for analysis, model in system.models.items():
+        named[f"parameters of {analysis}"] = list(model.parameters)
+        named[f"smooth of {analysis}"] = list(model.smooth.coordinates) if model.smooth else []
+    for where, given in named.items():
+        for name in given:
+            if name not in names:
+                raise InputError(f"{system.__name__}: {where}: {name!r} is not a parameter{nearest(name, names)}")
 
 
 def _models(system: type[System], method: Any) -> dict[str, Model]:
