@@ -23,7 +23,7 @@ from drivetrain_jax.runs import kernel
 from drivetrain_jax.runs.kernel import compile_kernel, result_variables
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
-from drivetrain_jax.systems import Smoothness, System, get_system, parameter, serves
+from drivetrain_jax.systems import LinearPeriodic, Smoothness, System, get_system, parameter, serves
 from tests.sizes import but_full
 
 BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
@@ -179,7 +179,11 @@ def swept(function, over=None, **options):
 def declared(units="1", roles=(), model=None, **serving):
     """A new system with the parameter ``omega``."""
     own = {"name": "own", "title": "own", "__annotations__": {"omega": float}, "roles": dict(roles)}
-    build = serves("floquet", **serving)(lambda self: model)
+
+    def build(self):
+        return model
+
+    build = serves("floquet", **serving)(build)
     return type("Own", (System,), own | {"omega": parameter(units, "speed"), "build": build})
 
 
@@ -189,6 +193,9 @@ def declared(units="1", roles=(), model=None, **serving):
         (lambda: declared(units="N/furlong"), "Own.omega: units = 'N/furlong'; allowed is 1 or units such as"),
         (lambda: declared(roles={"speed": "omeg"}), r"Own: roles\['speed'\]: 'omeg' is not a parameter "),
         (lambda: declared(smooth=Smoothness({"kk": None})), "Own: smooth of floquet: 'kk' is not a parameter"),
+        (lambda: dt.floquet(declared()(omega=1.0)), "Own.build returned NoneType; allowed is a model of the class Fl"),
+        (lambda: dt.floquet(declared(model=1.0)(omega=1.0)), "Own.build returned float; allowed is a model of the class Fl"),
+        (lambda: LinearPeriodic(lambda t: ((1.0,),), -1.0), "span = -1: allowed is 0 < span"),
         (lambda: declared(parameters=("om",)), "Own: parameters of floquet: 'om' is not a parameter"),
         (lambda: replace(get_analysis("modes"), methods={"m": ("zz",)}), r"methods\['m'\] of analysis modes: 'zz' is not"),
         (lambda: dt.Cardan(beta=17, Omega=1.4, **BASE), "beta = 17: allowed is -1.57"),

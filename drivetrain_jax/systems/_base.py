@@ -29,12 +29,28 @@ from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
 from drivetrain_jax._units import is_unit
 from drivetrain_jax._wording import meant, nearest
 from drivetrain_jax.resonances import Resonances, Values
+from drivetrain_jax.systems._flow import Flow
+from drivetrain_jax.systems._modal import DrivenSprings, SpringSystem
+from drivetrain_jax.systems._periodic import FloquetModel, ForcedModel
 from drivetrain_jax.systems._physical import PhysicalData
+from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator
+from drivetrain_jax.systems._shaft import Shaft
 from drivetrain_jax.systems._smooth import Smoothness
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 Number = float | Array | np.ndarray
 _PARAMETER, _SERVES = "parameter", "_serves"
+# The usual class of the model of an analysis.
+_MODELS: dict[str, type] = {
+    **dict.fromkeys(("floquet", "atlas"), FloquetModel),
+    "forced": ForcedModel,
+    **dict.fromkeys(("history", "lyapunov", "poincare"), Flow),
+    "parameters": Mapping,
+    **dict.fromkeys(("steady_state", "basins", "frequency_response"), PiecewiseLinearOscillator),
+    "modes": SpringSystem,
+    "harmonic_response": DrivenSprings,
+    "critical_speeds": Shaft,
+}
 # What people give as a value, right or wrong.
 _DATA = (Complex, Decimal, str, bytes, list, tuple, dict, set, PathLike)
 
@@ -242,8 +258,14 @@ def _models(system: type[System], method: Any) -> dict[str, Model]:
     if not marks:
         return {}
 
+    kinds = tuple({known.get("returns") or _MODELS.get(name, object) for name, known in marks.items()})
+
     def build(values: Values) -> Any:
-        return method(system.of(values))
+        model = method(system.of(values))
+        if model is None or not isinstance(model, kinds):
+            where, allowed = f"{system.__name__}.{method.__name__}", " or ".join(sorted(k.__name__ for k in kinds))
+            raise InputError(f"{where} returned {type(model).__name__}; allowed is a model of the class {allowed}")
+        return model
 
     # The source file of a model determines its digest.
     build.__wrapped__ = method  # pyright: ignore[reportFunctionMemberAccess]

@@ -78,8 +78,10 @@ class LinearPeriodic(eqx.Module):
     def __check_init__(self) -> None:
         ends = (0.0, *self.breakpoints, self.span)
         # Values of a batch are not checked: a lane with a wrong one has no value.
-        if not self.breakpoints or any(isinstance(x, jax.core.Tracer) or np.ndim(x) for x in ends):
+        if any(isinstance(x, jax.core.Tracer) or np.ndim(x) for x in ends):
             return
+        if not self.span > 0:
+            raise InputError(f"span = {self.span:g}: allowed is 0 < span")
         for i, value in enumerate(self.breakpoints):
             if not ends[i] < value < self.span:
                 raise InputError(

@@ -140,7 +140,7 @@ class Order8(EqualSteps):
     def piece(self, system: LinearPeriodic, t0: Any, t1: Any) -> tuple[Array, Array]:
         """See :class:`EqualSteps`."""
         # The other fields of the system are not used.
-        arrays, rest = eqx.partition(LinearPeriodic(system.rows, 0.0, system.basis), eqx.is_array)
+        arrays, rest = eqx.partition(LinearPeriodic(system.rows, 1.0, system.basis), eqx.is_array)
         shared = jnp.asarray(t0, float), jnp.asarray(t1, float), self.count
         if not jax.tree.leaves(arrays) or not system.is_pytree:
             # No arrays to batch, or a function that may depend on unknown arrays.
