@@ -186,6 +186,8 @@ class _Scan:
         if offset is not None and offset + variable.nbytes > self._size:
             raise ValueError(f"{name!r} lies behind the end of the file")
         self._attributes(variable)
+        if variable.ndim and not _has_right_links(variable):
+            raise ValueError(f"{name!r} names its dimensions by attributes of another type")
         for axis in range(variable.ndim):
             if h5py.h5ds.get_num_scales(variable.id, axis):
                 h5py.h5ds.iterate(variable.id, axis, lambda _: None, 0)
@@ -203,3 +205,18 @@ class _Scan:
             if owner.attrs.get_id(name).get_storage_size() > self._size:
                 raise ValueError(f"the attribute {name!r} of {owner.name!r} is larger than the file")
             owner.attrs[name]
+
+
+def _has_right_links(variable: h5py.Dataset) -> bool:
+    """True if scales and labels of the dimensions have the type and shape that HDF5 takes for granted."""
+    right = True
+    for name in {"DIMENSION_LIST", "DIMENSION_LABELS"} & set(variable.attrs):
+        found = variable.attrs.get_id(name)
+        if name == "DIMENSION_LIST":
+            entry = h5py.check_vlen_dtype(found.dtype)
+            linked = entry is not None and h5py.check_ref_dtype(entry) is h5py.Reference
+        else:
+            text = h5py.check_string_dtype(found.dtype)
+            linked = text is not None and text.length is None
+        right = right and linked and found.shape == (variable.ndim,)
+    return right

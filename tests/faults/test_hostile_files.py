@@ -53,7 +53,16 @@ def virtual(file):
     file.create_virtual_dataset("value", layout)
 
 
+def linked(name, content):
+    """The variable ``value`` with its dimensions named by an attribute of another type: HDF5 may crash on it."""
+    return lambda file: file.create_dataset("value", data=np.zeros(3)).attrs.__setitem__(name, content)
+
+
 HOSTILE = {
+    "a number as scales": linked("DIMENSION_LIST", 1.5),
+    "words as scales": linked("DIMENSION_LIST", ["a", "b", "c"]),
+    "a number as labels": linked("DIMENSION_LABELS", np.zeros(1)),
+    "labels of another shape": linked("DIMENSION_LABELS", "a"),
     "8 TB": lambda f: f.create_dataset("value", (1000, 10**9), "f8", chunks=(1000, 1000)),
     "8 TB in one block": lambda f: f.create_dataset("value", (1000, 10**9), "f8"),
     "link": lambda f: f.__setitem__("value", h5py.SoftLink("/a")),
