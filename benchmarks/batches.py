@@ -39,13 +39,13 @@ scene, out, cores, runs = json.loads(sys.argv[1]), sys.argv[2], int(sys.argv[3])
 os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
 start = time.perf_counter()
 from pathlib import Path
-from drivetrain_jax.runs import compile_cache
+from drivetrain_jax import _compile_cache
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.kernel import kernel_of
 from drivetrain_jax.runs.run import run, run_to_file
 from drivetrain_jax.runs.scene import load_scene
 imported = time.perf_counter()
-compile_cache.enable()
+_compile_cache.enable(short=True)
 engine = resolve(load_scene(scene))
 for group in engine.plan.groups:
     kernel_of(engine.scene, engine.grid, group.solver, group.chunk)
