@@ -400,7 +400,11 @@ GOOD = {"wave": np.ones(3), "outcome": 0}
         (None, "part", "solve returned NoneType; allowed is a dict of wave, outcome"),
         ({"outcome": 0}, "part", "solve returned outcome, not wave; allowed is wave, outcome"),
         ({"wave": np.ones(3)}, "part", "solve returned wave, not outcome; allowed is wave, outcome"),
-        (GOOD | {"waves": 1}, "part", "solve returned 'waves', which is not declared (did you mean wave?); allowed is "),
+        (
+            GOOD | {"waves": 1},
+            "part",
+            "solve returned 'waves', which is not declared (did you mean wave?); allowed is ",
+        ),
         (GOOD | {"wave": np.ones(4)}, "part", "wave has the shape (4,); allowed is (part = 3, lanes)"),
         (GOOD | {"wave": 1.0}, "part", "wave has the shape (); allowed is (part = 3, lanes)"),
         (GOOD | {"wave": None}, "part", "wave is of type NoneType; allowed is an array (part = 3, lanes)"),
