@@ -129,12 +129,14 @@ def _write(path: Path, kernel: jax.stages.Compiled) -> None:
     if calls(kernel, "xla_ffi_python") or calls(kernel, "xla_python"):
         # A call of Python code cannot be stored.
         return
-    # A backend may be unable to store its kernels, and results of other types than those of Python have no form on disk.
-    with suppress(ValueError, NotImplementedError, jax.errors.JaxRuntimeError):
+    try:
         code, _, out = serialize_executable.serialize(kernel)
         parts = {"code": code, "results": out.serialize_using_proto()}
-        content = {name: np.frombuffer(part, np.uint8) for name, part in parts.items()}
-        _store(path, _arrays(lapack=np.array(calls(kernel, "lapack_")), **content))
+    except (ValueError, NotImplementedError, jax.errors.JaxRuntimeError):
+        # A backend may be unable to store its kernels, and results of other types than those of Python have no form on disk.
+        return
+    content = {name: np.frombuffer(part, np.uint8) for name, part in parts.items()}
+    _store(path, _arrays(lapack=np.array(calls(kernel, "lapack_")), **content))
 
 
 def _arrays(**arrays: np.ndarray) -> bytes:

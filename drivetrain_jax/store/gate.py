@@ -209,7 +209,6 @@ class _Scan:
 
 def _has_right_links(variable: h5py.Dataset) -> bool:
     """True if scales and labels of the dimensions have the type and shape that HDF5 takes for granted."""
-    right = True
     for name in {"DIMENSION_LIST", "DIMENSION_LABELS"} & set(variable.attrs):
         found = variable.attrs.get_id(name)
         if name == "DIMENSION_LIST":
@@ -218,5 +217,6 @@ def _has_right_links(variable: h5py.Dataset) -> bool:
         else:
             text = h5py.check_string_dtype(found.dtype)
             linked = text is not None and text.length is None
-        right = right and linked and found.shape == (variable.ndim,)
-    return right
+        if not linked or found.shape != (variable.ndim,):
+            return False
+    return True
