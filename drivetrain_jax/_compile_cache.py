@@ -8,11 +8,14 @@ import tempfile
 from pathlib import Path
 
 import jax
+from filelock import FileLock, Timeout
 
 from drivetrain_jax._machine import instruction_set
 
 _VARIABLE = "DRIVETRAIN_JAX_CACHE"
 _MAX_BYTES = 1 << 29
+# With a limit of size jax reads a date for each entry whenever it keeps a program: 7 us an entry.
+_MAX_ENTRIES = 1000
 
 
 def enable(*, short: bool = False) -> None:
@@ -29,6 +32,7 @@ def enable(*, short: bool = False) -> None:
     if not used:
         if not _writable(folder):
             return
+        _prune(folder)
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_compilation_cache_max_size", _MAX_BYTES)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
@@ -49,6 +53,25 @@ def _folder(wanted: str) -> Path:
     root = Path(wanted) if wanted else base / "drivetrain_jax"
     content = " ".join((*sorted(instruction_set()), jax.__version__))
     return root / hashlib.blake2b(content.encode(), digest_size=16).hexdigest()
+
+
+def _prune(folder: Path) -> None:
+    """Remove entries without a date, beside which jax keeps no program; of too many, those used longest ago."""
+    entries = {path.name.removesuffix("-cache") for path in folder.glob("*-cache")}
+    dates = {path.name.removesuffix("-atime"): path for path in folder.glob("*-atime")}
+    surplus = entries - dates.keys()
+    try:
+        if len(entries) > _MAX_ENTRIES:
+            by_use = sorted(entries & dates.keys(), key=lambda key: dates[key].stat().st_mtime_ns)
+            surplus |= set(by_use[: -_MAX_ENTRIES // 2])
+        if surplus:
+            # The lock of jax's own cache.
+            with FileLock(folder / ".lockfile", timeout=0):
+                for key in surplus:
+                    (folder / f"{key}-cache").unlink(missing_ok=True)
+                    (folder / f"{key}-atime").unlink(missing_ok=True)
+    except (OSError, Timeout):
+        return
 
 
 def _writable(folder: Path) -> bool:
