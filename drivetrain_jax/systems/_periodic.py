@@ -56,12 +56,13 @@ class LinearPeriodic(eqx.Module):
     """The linear system ``x' = A(t) x`` over one interval ``[0, span]`` of its clock ``t``.
 
     ``basis(t)`` returns the functions of the clock alone, which all points of a batch share. ``rows(*basis(t))`` is the
-    matrix as nested tuples; an entry that vanishes identically is the integer ``0``. Without ``reversor`` the interval is
-    the period and the monodromy matrix is the propagator ``Phi`` itself. With the reversor ``X`` (``X X = I``) the interval
-    is half the period and the monodromy matrix is similar to ``X Phi^T X Phi``. With ``reversal()``, two matrices
-    ``(R0, R1)`` as rows, the monodromy matrix is similar to ``R0 Phi^T R1 Phi``. ``log_determinant()`` is the exact
-    logarithm of the determinant of the monodromy matrix (Liouville's formula), if known. ``breakpoints`` are the instants,
-    rising within the span, at which the matrix jumps or has a kink: steps of integrations end there.
+    matrix as nested tuples; an entry that vanishes identically is the integer ``0``. A span that depends on parameters is
+    marched in fractions of itself, without a common ``basis``. Without ``reversor`` the interval is the period and the
+    monodromy matrix is the propagator ``Phi`` itself. With the reversor ``X`` (``X X = I``) the interval is half the period
+    and the monodromy matrix is similar to ``X Phi^T X Phi``. With ``reversal()``, two matrices ``(R0, R1)`` as rows, the
+    monodromy matrix is similar to ``R0 Phi^T R1 Phi``. ``log_determinant()`` is the exact logarithm of the determinant of
+    the monodromy matrix (Liouville's formula), if known. ``breakpoints`` are the instants, rising within the span, at which
+    the matrix jumps or has a kink: steps of integrations end there.
 
     The system is a pytree if its functions are pytrees, such as the bound methods of an Equinox module. Its term for any
     solver of diffrax is ``diffrax.ODETerm(system.vf)``.
@@ -90,11 +91,12 @@ class LinearPeriodic(eqx.Module):
 
     @property
     def parts(self) -> tuple[LinearPeriodic, ...]:
-        """The system between its breakpoints, in order: one of span 1 for each piece, or the system itself without any.
+        """The system between its breakpoints, in order: one of span 1 for each piece.
 
-        A piece of negative length, from a breakpoint outside of the span, is NaN.
+        Without any, and with a span that is a plain number, the system itself. A piece of negative length, from a breakpoint
+        outside of the span, is NaN.
         """
-        if not self.breakpoints:
+        if not self.breakpoints and isinstance(self.span, float | int):
             return (self,)
         ends = [jnp.asarray(x, float) for x in (0.0, *self.breakpoints, self.span)]
         pieces = []

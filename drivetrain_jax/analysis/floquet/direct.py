@@ -113,7 +113,7 @@ def stable_steps(system: LinearPeriodic) -> Array:
     # Only the diagonal is used: the compiler drops the other entries.
     entries = _entries(system, jnp.arange(5)[:, None] * system.span / 4)
     rate = -sum((entry for (i, j), entry in entries.items() if i == j), jnp.zeros(()))
-    return jnp.nanmax(rate, initial=0.0) * system.span / _STABLE
+    return jnp.nanmax(rate * system.span, initial=0.0) / _STABLE
 
 
 def _entries(system: LinearPeriodic, times: Array) -> dict[tuple[int, int], Array]:
