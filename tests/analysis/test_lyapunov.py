@@ -516,7 +516,7 @@ FORCED = (
     (3000.03, 0.1, 6.0, _M, 0.0, Verdict.QUASI_PERIODIC, 0),  # repeats after 100001, nearly after 10
     (2718.281828, 1e-5, 6.0, _M, 0.0, Verdict.QUASI_PERIODIC, 0),  # a torus thinner than the transient
     (2718.281828, 0.0, 6.0, _M, 0.0, Verdict.FIXED_POINT, 1),
-    (3000.0, 0.1, 6.0, 0.0, 1e-3, Verdict.UNDECIDED, 0),  # a transient alone
+    (3000.0, 0.1, 6.0, 0.0, 1e-3, Verdict.FIXED_POINT, 1),  # two negative exponents: it decays to rest
 )
 
 
