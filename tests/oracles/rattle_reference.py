@@ -33,12 +33,24 @@ class _Region:
     amplitude: np.longdouble
     omega: np.longdouble
 
-    def start(self, t: np.longdouble, u: np.longdouble, v: np.longdouble) -> Callable[[np.ndarray], tuple]:
-        """``u, v`` as functions of the time elapsed since ``t``."""
+    @property
+    def roots(self) -> tuple:
+        """Exponents of the free motion, the slower one first."""
         half = self.damping / 2
         root = np.sqrt(Complex(half * half - self.stiffness))
         fast = -half - root if (half + root).real >= (half - root).real else -half + root
-        slow = self.stiffness / fast
+        return self.stiffness / fast, fast
+
+    def transition(self, elapsed: np.longdouble) -> np.ndarray:
+        """Derivatives of ``u, v`` after ``elapsed`` by those at the start."""
+        slow, fast = self.roots
+        a, b = np.exp(slow * elapsed), np.exp(fast * elapsed)
+        rows = [slow * b - fast * a, a - b], [slow * fast * (b - a), slow * a - fast * b]
+        return np.array(rows / (slow - fast)).real
+
+    def start(self, t: np.longdouble, u: np.longdouble, v: np.longdouble) -> Callable[[np.ndarray], tuple]:
+        """``u, v`` as functions of the time elapsed since ``t``."""
+        slow, fast = self.roots
         response = Complex(self.amplitude) / (self.stiffness - self.omega**2 + Complex(1j) * self.damping * self.omega)
         drift = Real(0) if self.stiffness else self.force / self.damping
         rest = self.force / self.stiffness if self.stiffness else Real(0)
@@ -146,9 +158,20 @@ def _regions(values: Mapping[str, float]) -> dict[int, tuple[_Region, tuple]]:
 
 def extended(values: Mapping[str, float], u0: float, v0: float, periods: int) -> tuple[float, float, int]:
     """``u, v`` after ``periods`` drive periods and the number of flank crossings. Needs c > 0."""
+    u, v, crossings, _ = extended_motion(values, u0, v0, periods)
+    return float(u), float(v), crossings
+
+
+def extended_motion(
+    values: Mapping[str, float], u0: float, v0: float, periods: int
+) -> tuple[np.longdouble, np.longdouble, int, np.ndarray]:
+    """:func:`extended` without rounding at the end, and the derivatives of ``u, v`` by ``u0, v0``.
+
+    The restoring force is continuous at a flank, and so are the derivatives.
+    """
     regions, b = _regions(values), Real(values["b"])
     period = 2 * np.arctan2(Real(0), Real(-1)) / Real(values["omega"])
-    u, v, crossings = Real(u0), Real(v0), 0
+    u, v, crossings, matrix = Real(u0), Real(v0), 0, np.eye(2, dtype=Real)
     side = 1 if u > b else -1 if u < -b else 0
     for _ in range(periods):
         t = Real(0)
@@ -157,13 +180,14 @@ def extended(values: Mapping[str, float], u0: float, v0: float, periods: int) ->
             at = region.start(t, u, v)
             elapsed = _exit(at, region, bounds, period - t)
             u, v = at(elapsed)
+            matrix = region.transition(elapsed) @ matrix
             if elapsed >= period - t:
                 break
             t += elapsed
             crossings += 1
             # The bisection ends beyond the flank.
             side = 1 if u > b else -1 if u < -b else 0
-    return float(u), float(v), crossings
+    return u, v, crossings, matrix
 
 
 def field(values: Mapping[str, float], side: int | None = None) -> Callable:
