@@ -60,6 +60,8 @@ _ASTRAY, _COSTLY = 3.0, 4
 # the natural frequency and damping down to 1e-4, 62 need at most 5e5, and the others do not repeat within 2e6.
 _BUDGET, _PER_PERIOD = 4e5, 100
 _EPS = np.finfo(float).eps
+# Rounding of a period over that of the states at its steps.
+_GROWTH = 64
 
 
 class Attractors(NamedTuple):
@@ -143,11 +145,14 @@ def _shoot(
 
 
 def _rounding(lanes: Lanes, motion: Motion, state: tuple[Array, Array], omega: Array) -> Array:
-    """Effect on the u of an orbit of rounding the motion over its period."""
+    """Effect on the u of an orbit of rounding the motion over its period.
+
+    Rounding may grow within the period, which is not followed: at 200,000 random orbits by up to 35 in place of `_GROWTH`.
+    """
     by_u, by_v = (newton_correction(motion.matrix, 1.0 - k + 0 * motion.u, k * omega)[0] for k in (0.0, 1.0))
     inverse = jnp.abs(by_u) + jnp.abs(by_v)
     size = jnp.abs(state[0]) + jnp.abs(state[1]) / omega
-    rounding = 32 * size * jnp.sqrt(motion.steps.astype(float)) + 2 * _taken_off(lanes, motion)
+    rounding = _GROWTH * size * jnp.sqrt(motion.steps.astype(float)) + 2 * _taken_off(lanes, motion)
     return _EPS * rounding * (1 + inverse)
 
 
