@@ -68,7 +68,12 @@ def dimensions_of(
 def checked_solvers(
     analysis: Analysis, system: type[System], request: Request, dimensions: Sequence[Dimension]
 ) -> tuple[Solver, ...]:
-    """The solvers of ``request``. Wrong results of a solver raise :class:`InputError` when they are traced."""
+    """The solvers of ``request``. Wrong results of a solver raise :class:`InputError` when they are traced.
+
+    Those of a continuous analysis return values from which its function is made, and are not checked.
+    """
+    if analysis.continuous:
+        return tuple(analysis.solvers(system, request))
     path = analysis.path_axis(system, request) is not None
     sizes = {each.name: len(each.values) for each in dimensions}
     return tuple(

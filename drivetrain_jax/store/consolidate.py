@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -126,13 +126,20 @@ def read_attribute(path: Path, name: str) -> str | None:
 def read_variable(path: Path, name: str) -> np.ndarray:
     """One variable of the result at ``path``, without loading the others; ``InputError`` if it cannot be read."""
     with gate.opened(path) as file:
-        return cast(h5py.Dataset, file[name])[()]
+        return _variable(file, name)[()]
+
+
+def _variable(file: h5py.File, name: str) -> h5py.Dataset:
+    variable = file[name]
+    if not isinstance(variable, h5py.Dataset):
+        raise TypeError(f"{name} is a {type(variable).__name__.lower()}, not a variable")
+    return variable
 
 
 def map_variable(path: Path, name: str) -> np.ndarray:
     """Like :func:`read_variable`, but as a memory map where the storage of the variable allows that."""
     with gate.opened(path) as file:
-        variable = cast(h5py.Dataset, file[name])
+        variable = _variable(file, name)
         # The words of a file are references, which only HDF5 can follow.
         plain = variable.chunks is None and not variable.dtype.hasobject
         if plain and (offset := variable.id.get_offset()) is not None and variable.size:

@@ -19,6 +19,7 @@ from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.run import run_to_file
 from drivetrain_jax.runs.status import status
 from drivetrain_jax.store import checksums, gate
+from drivetrain_jax.store.consolidate import map_variable, read_variable
 
 pytestmark = pytest.mark.usefixtures("toys")
 
@@ -116,6 +117,13 @@ def test_sealed_content_of_no_result_is_one_line(path, capsys, kind):
         said = capsys.readouterr().err
         assert code in (0, 2) and len(said.splitlines()) == int(code == 2 or words.startswith("run")), (words, said)
     assert code == 2
+
+
+@pytest.mark.parametrize("read", [read_variable, map_variable])
+def test_a_group_in_place_of_a_variable_is_one_line(path, read):
+    replaced(path, UNFIT["group"])
+    with pytest.raises(InputError, match=r"^[^\n]*r\.nc[^\n]*$"):
+        read(path, "value")
 
 
 @pytest.mark.parametrize("solves", ["x", "", np.arange(2)])
