@@ -56,7 +56,7 @@ def _folder(wanted: str) -> Path:
 
 
 def _prune(folder: Path) -> None:
-    """Remove entries without a date, beside which jax keeps no program; of too many, those used longest ago."""
+    """Remove entries without a date, with which jax stores no further program, and of too many those used longest ago."""
     entries = {path.name.removesuffix("-cache") for path in folder.glob("*-cache")}
     dates = {path.name.removesuffix("-atime"): path for path in folder.glob("*-atime")}
     surplus = entries - dates.keys()

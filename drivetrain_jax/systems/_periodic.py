@@ -93,8 +93,8 @@ class LinearPeriodic(eqx.Module):
     def parts(self) -> tuple[LinearPeriodic, ...]:
         """The system between its breakpoints, in order: one of span 1 for each piece.
 
-        Without any, and with a span that is a plain number, the system itself. A piece of negative length, from a breakpoint
-        outside of the span, is NaN.
+        Without breakpoints, and with a plain number as span, the system itself. A piece of negative length, from a
+        breakpoint outside of the span, is NaN.
         """
         if not self.breakpoints and isinstance(self.span, float | int):
             return (self,)

@@ -87,8 +87,8 @@ CASES = {
     "lyapunov": (tripod, "lyapunov", {"element": "input"}, {"max_time": 0.05}),
 }  # fmt: skip
 SHORT = "parameters", "multiple scales", "slow flow"
-# All points of these march together, each as long as the longest.
-LONG = ("exact response", "forced", "harmonic balance")
+# A batch of these takes as long as if each point were its slowest one.
+LONG = ("exact response", "forced")
 SYSTEMS = {moving: "rattle"}
 
 

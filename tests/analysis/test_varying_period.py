@@ -28,7 +28,7 @@ class InSeconds(System):
     def rows(self, t):
         return (0, 1.0), (-(1 + jnp.cos(self.speed * t) / 2), -self.c)
 
-    @serves("floquet", "atlas")
+    @serves("floquet")
     def model(self):
         form = LinearPeriodic(self.rows, 2 * math.pi / self.speed)
         return FloquetModel(form, form)
@@ -43,7 +43,7 @@ class InTurns(InSeconds):
         s = 1 / self.speed
         return (0, s), (-(1 + jnp.cos(angle) / 2) * s, -self.c * s)
 
-    @serves("floquet", "atlas")
+    @serves("floquet")
     def model(self):
         form = LinearPeriodic(self.rows, 2 * math.pi)
         return FloquetModel(form, form)

@@ -147,7 +147,8 @@ def _shoot(
 def _rounding(lanes: Lanes, motion: Motion, state: tuple[Array, Array], omega: Array) -> Array:
     """Effect on the u of an orbit of rounding the motion over its period.
 
-    Rounding may grow within the period, which is not followed: at 200,000 random orbits by up to 35 in place of `_GROWTH`.
+    Rounding may grow within the period, which is not followed: with 32 in place of `_GROWTH`, the estimate was 7 % too small
+    at one of 200,000 random orbits.
     """
     by_u, by_v = (newton_correction(motion.matrix, 1.0 - k + 0 * motion.u, k * omega)[0] for k in (0.0, 1.0))
     inverse = jnp.abs(by_u) + jnp.abs(by_v)
