@@ -13,6 +13,7 @@ from typing import Any
 
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._wording import counted
 from drivetrain_jax.cli.replies import INCOMPLETE, INTERRUPTED, OK, one_line, say
 from drivetrain_jax.cli.signals import stop_on_signals
 from drivetrain_jax.cli.values import assignments, ranges
@@ -96,7 +97,14 @@ def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[An
             )
         except Incomplete as error:
             return error.progress, INCOMPLETE, str(error)
-    return progress, OK, "" if options.quiet else progress.note
+    return progress, OK, "" if options.quiet else _remarks(progress)
+
+
+def _remarks(progress: Any) -> str:
+    """The note of a finished run, and its number of inaccurate points."""
+    values = counted(progress.inaccurate, "value has", "values have")
+    inaccurate = f"{values} an error above the target (outcome tolerance_not_met)" if progress.inaccurate else ""
+    return "; ".join(filter(None, (progress.note, inaccurate)))
 
 
 def _progress_line(quiet: bool) -> Any:

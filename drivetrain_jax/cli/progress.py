@@ -37,8 +37,7 @@ def progress_line() -> Iterator[Callable[[Progress], None]]:
         done = progress.computed + progress.reused
         rate = progress.computed / max(time.monotonic() - begin, 1e-9)
         counts = f"{done}/{progress.total} {progress.kind}, {rate:.3g}/s" if progress.cost or done else "compiling"
-        failed = f", {progress.failed} failed" if progress.failed else ""
-        bar.update(task, total=progress.total_cost, completed=progress.cost, counts=counts + failed)
+        bar.update(task, total=progress.total_cost, completed=progress.cost, counts=counts + progress.exceptions)
 
     try:
         yield report

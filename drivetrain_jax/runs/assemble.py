@@ -139,6 +139,11 @@ def failures(outcome: np.ndarray) -> int:
     return int(np.count_nonzero(outcome >= FIRST_FAILURE))
 
 
+def inaccurate(outcome: np.ndarray) -> int:
+    """Number of outcomes with a value whose error exceeds the target."""
+    return int(np.count_nonzero(outcome == Outcome.TOLERANCE_NOT_MET))
+
+
 def missing_value(variable: Variable) -> float | int:
     """The value that marks a missing result of ``variable``."""
     if variable.name == OUTCOME.name:

@@ -66,7 +66,6 @@ def _html(progress: Progress, seconds: float) -> str:
     done = progress.computed + progress.reused
     # The cost grows evenly in time; points are counted if it is unknown.
     part, whole = (progress.cost, progress.total_cost) if progress.total_cost else (done, max(progress.total, 1))
-    failed = f", {progress.failed} failed" if progress.failed else ""
     rate = progress.computed / max(seconds, 1e-9)
-    text = f"{done}/{progress.total} {progress.kind}, {rate:.3g}/s, {seconds:.0f} s{failed}"
+    text = f"{done}/{progress.total} {progress.kind}, {rate:.3g}/s, {seconds:.0f} s{progress.exceptions}"
     return f'<progress value="{part / whole:.4f}" max="1"></progress> {text}'

@@ -13,7 +13,7 @@ import numpy as np
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import clipped
-from drivetrain_jax.runs.assemble import failures
+from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.runs.explain import differences
 from drivetrain_jax.runs.growing import NO_REUSE, Damaged, NotReusable, ReusableResult, ReusedPoints, combined, find
 from drivetrain_jax.runs.job import Job
@@ -216,18 +216,13 @@ class OutputState:
         return f"{what} of another scene or version: {'; '.join(reasons[:2]) or 'other sizes of chunks'}{more}"
 
     @property
-    def failed(self) -> int:
-        """Number of points without a value in the complete result. An atlas has no points."""
-        return 0 if self._solves is not None else failures(self.sink.outcomes())
+    def outcomes(self) -> np.ndarray:
+        """Outcomes of the points of the complete result. An atlas has no points."""
+        return np.empty(0, OUTCOME.dtype) if self._solves is not None else self.sink.outcomes()
 
     def points(self, total: int) -> int:
         """Number of points of the complete result, or of solves of an atlas."""
         return total if self._solves is None else self._solves
-
-    @property
-    def is_function(self) -> bool:
-        """True if the complete result is a function of the parameters (an atlas)."""
-        return self._solves is not None
 
     @property
     def _solves(self) -> int | None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.analysis.atlas.solves import PROPAGATOR
-from drivetrain_jax.runs.assemble import ResultBuffer, bytes_per_point, failures, labelled
+from drivetrain_jax.runs.assemble import ResultBuffer, bytes_per_point, labelled
 from drivetrain_jax.runs.growing import NO_REUSE, NotReusable, ReusableResult, ReusedPoints, find, remaining
 from drivetrain_jax.runs.job import Job, Route
 from drivetrain_jax.runs.layout import rearranged
@@ -82,7 +82,7 @@ class DirectRoute(PointsRoute):
         for points, results in reused.blocks([variable.name for variable in buffer.variables]):
             buffer.fill(points, results)
             progress.reused += results[OUTCOME.name].size
-            progress.failed += failures(results[OUTCOME.name])
+            progress.count(results[OUTCOME.name])
         work.do(remaining(job, reused), buffer, progress)
         return reused.attrs
 

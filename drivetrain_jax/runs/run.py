@@ -110,7 +110,9 @@ def run_to_file(
     if not fresh and output.state == "complete":
         output.parts.discard(output.digest, output.sink.written)
         total = output.points(job.total)
-        return Progress(total, reused=total, failed=output.failed)
+        progress = Progress(total, reused=total)
+        progress.count(output.outcomes)
+        return progress
     if not fresh and output.state == "stale":
         raise output.refusal
     output.check_writable()

@@ -11,7 +11,7 @@ import numpy as np
 
 from drivetrain_jax._errors import RetryableError
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.runs.assemble import failures, missing_value
+from drivetrain_jax.runs.assemble import failures, inaccurate, missing_value
 from drivetrain_jax.runs.executor import Results
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.pending import PENDING
@@ -24,7 +24,7 @@ from drivetrain_jax.store.shards import Place
 # Numbers that a block reserves for its chunks, more than it can have.
 NUMBERS = 1 << 20
 # Names of the results of each share.
-FOUND = ("next", "chunks", "part", "written", "points", "failed")
+FOUND = ("next", "chunks", "part", "written", "points", "failed", "inaccurate")
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ class ShardWriter:
         joined = {name: np.array(column) for name, column in zip(FOUND, zip(*found, strict=True), strict=True)}
         return joined | {"seconds": np.array(time.monotonic() - begin)}
 
-    def _solve_share(self, share: Share, end: float) -> tuple[int, int, str, bool, int, int]:
-        """Next chunk, number of chunks of the block, name of the part (empty without one), ``written``, points, failures.
+    def _solve_share(self, share: Share, end: float) -> tuple[int, int, str, bool, int, int, int]:
+        """Next chunk, number of chunks of the block, name of the part (empty without one), ``written``, counts of points.
 
         A share that is a whole block is ``written``: its shard is in the store.
         """
@@ -110,8 +110,8 @@ class ShardWriter:
         name = PartsFolder(Path(self.out)).write(part) if part and not written else ""
         outcome = part.results[OUTCOME.name] if part else np.empty(0, OUTCOME.dtype)
         unsolvable = count_unsolvable(self.job, share)
-        points, failed = outcome.size + unsolvable, failures(outcome) + unsolvable
-        return position, len(plan.costs), name, written, points, failed
+        counts = outcome.size + unsolvable, failures(outcome) + unsolvable, inaccurate(outcome)
+        return position, len(plan.costs), name, written, *counts
 
     def _assemble(self, task: Assembly) -> Results:
         begin, parts = time.monotonic(), PartsFolder(Path(self.out))

@@ -22,7 +22,7 @@ import numpy as np
 
 from drivetrain_jax._errors import RetryableError
 from drivetrain_jax.analysis import OUTCOME
-from drivetrain_jax.runs.assemble import dimension_sizes, failures, labelled, missing_value
+from drivetrain_jax.runs.assemble import dimension_sizes, labelled, missing_value
 from drivetrain_jax.runs.executor import Executor, Results
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.pending import PENDING, with_pending
@@ -118,7 +118,7 @@ class ShardedRun:
         for shard, _, results in written_shards(self._job, self.path):
             written[shard] = True
             self._progress.reused += results[OUTCOME.name].size
-            self._progress.failed += failures(results[OUTCOME.name])
+            self._progress.count(results[OUTCOME.name])
         return written
 
     def _reuse_parts(self, written: np.ndarray) -> None:
@@ -132,7 +132,7 @@ class ShardedRun:
             self._names[block].append(part.name)
             outcome = part.results[OUTCOME.name]
             self._progress.reused += outcome.size
-            self._progress.failed += failures(outcome)
+            self._progress.count(outcome)
 
     def __iter__(self) -> Iterator[Shares | Assembly]:
         return self
@@ -220,7 +220,7 @@ class ShardedRun:
         rows = list(zip(*(results[name].tolist() for name in FOUND), strict=True))
         if points := int(results["points"].sum()):
             self._seconds_per_point = float(results["seconds"]) / points
-        for share, (begin, chunks, part, written, computed, failed) in zip(task.shares, rows, strict=False):
+        for share, (begin, chunks, part, written, *counts) in zip(task.shares, rows, strict=False):
             if part:
                 self._names[share.block].append(part)
                 self._changed.add(share.block)
@@ -228,7 +228,7 @@ class ShardedRun:
                 points = share.points * left // len(range(share.start, chunks, share.step))
                 pieces = round(points * self._seconds_per_point / self._seconds)
                 self._divide(replace(share, points=points), begin, min(left, max(1, pieces), _MOST_PIECES))
-            self._count(computed, failed)
+            self._count(*counts)
             self._close(share, written=bool(written))
         self._waiting.extendleft(reversed(task.shares[len(rows) :]))
 
@@ -271,15 +271,17 @@ class ShardedRun:
                     self._count(lost, lost)
                 else:
                     self._names[block].append(self._parts.write(joined_part([chunk], [results], 0.0)))
-                    self._count(results[OUTCOME.name].size, failures(results[OUTCOME.name]))
+                    self._progress.count(results[OUTCOME.name])
+                    self._count(results[OUTCOME.name].size)
         unsolvable = count_unsolvable(job, share)
         self._count(unsolvable, unsolvable)
         self._close(share)
 
-    def _count(self, points: int, failed: int) -> None:
+    def _count(self, points: int, failed: int = 0, inaccurate: int = 0) -> None:
         self._progress.cost += points
         self._progress.computed += points
         self._progress.failed += failed
+        self._progress.inaccurate += inaccurate
         self._report_progress()
 
     def _report_progress(self) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.runs.assemble import failures
 from drivetrain_jax.runs.output_state import OutputState
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
@@ -25,7 +24,8 @@ class Status:
     """Counts of the points at ``out``, and the state: absent, partial, complete or stale (another scene).
 
     ``failed_by_outcome`` counts the points without a value by outcome; ``remedy`` says what may help those that have not
-    converged. ``reason`` is the error message that a run would give, empty without one.
+    converged. ``inaccurate`` points have a value whose error exceeds the target. ``reason`` is the error message that a run
+    would give, empty without one.
     """
 
     total: int
@@ -35,17 +35,19 @@ class Status:
     failed_by_outcome: Mapping[str, int] = field(default_factory=dict)
     reason: str = ""
     remedy: str = ""
+    inaccurate: int = 0
 
     def __str__(self) -> str:
         lines = [f"{self.state}: {self.done} of {self.total} points done, {self.failed} without a value"]
         hints = {"not_converged": f" ({self.remedy})" if self.remedy else ""}
         lines += [f"  {name}: {count}{hints.get(name, '')}" for name, count in self.failed_by_outcome.items()]
+        lines += [f"  tolerance_not_met: {self.inaccurate}, with a value"] if self.inaccurate else []
         return "\n".join([*lines, *([f"  a run would stop: {self.reason}"] if self.reason else [])])
 
     def to_json(self) -> str:
         """The counts, the state and the reason as one JSON object."""
         content = {name: getattr(self, name) for name in ("total", "done", "failed", "state")}
-        more = {"failed_by_outcome": dict(self.failed_by_outcome), "reason": self.reason}
+        more = {"failed_by_outcome": dict(self.failed_by_outcome), "inaccurate": self.inaccurate, "reason": self.reason}
         return json.dumps(content | {name: value for name, value in more.items() if value})
 
 
@@ -59,36 +61,35 @@ def status(
         reason = f"it holds {output.obstacle}; {output.remedy}"
         return Status(total, 0, 0, output.state, reason=reason)
     try:
-        found = _counts(output)
+        codes = _codes(output)
     except InputError as error:
         return Status(total, 0, 0, "stale", reason=str(error))
-    done = output.points(found.done) if output.state == "complete" else found.done
-    remedy = job.scene.analysis.remedy(job.scene.request)
-    return Status(job.route.total(job, done), done, found.failed, output.state, found.by_outcome, remedy=remedy)
+    done = output.points(codes.total()) if output.state == "complete" else codes.total()
+    without = {o.name.lower(): codes[o] for o in Outcome if not o.has_value and codes[o]}
+    return Status(
+        job.route.total(job, done),
+        done,
+        sum(without.values()),
+        output.state,
+        without,
+        remedy=job.scene.analysis.remedy(job.scene.request),
+        inaccurate=codes[Outcome.TOLERANCE_NOT_MET],
+    )
 
 
-@dataclass(frozen=True)
-class _Counts:
-    done: int
-    failed: int
-    by_outcome: Mapping[str, int]
-
-
-def _counts(output: OutputState) -> _Counts:
-    done, failed, codes = 0, 0, Counter[int]()
+def _codes(output: OutputState) -> Counter[int]:
+    """Number of finished points by outcome."""
+    codes = Counter[int]()
     for outcome in _outcomes(output):
-        done += outcome.size
-        failed += failures(outcome)
         codes.update(dict(zip(*(part.tolist() for part in np.unique(outcome, return_counts=True)), strict=True)))
-    by_outcome = {o.name.lower(): codes[o] for o in Outcome if not o.has_value and codes[o]}
-    return _Counts(done, failed, by_outcome)
+    return codes
 
 
 def _outcomes(output: OutputState) -> Iterator[np.ndarray]:
     """Outcomes of all finished points."""
     if output.state == "complete":
         # An atlas has no points.
-        yield from () if output.is_function else (output.sink.outcomes(),)
+        yield output.outcomes
     elif output.state == "partial":
         seen, written = set[int](), set[int]()
         for shard, _, results in output.sink.shards(output.job):

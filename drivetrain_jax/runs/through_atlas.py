@@ -12,7 +12,7 @@ import numpy as np
 from drivetrain_jax._threads import in_double_precision
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.atlas import StabilityAtlas, prepare_judging
-from drivetrain_jax.runs.assemble import ResultBuffer, failures
+from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.atlas_choice import Ranges
 from drivetrain_jax.runs.growing import ReusedPoints
 from drivetrain_jax.runs.job import Job
@@ -94,7 +94,8 @@ def evaluate(
         lost = np.argwhere(outcome == Outcome.LOST) + [part.start for part in block]
         uncovered.append(np.ravel_multi_index(tuple(lost.T), job.grid.shape))  # pyright: ignore[reportArgumentType]
         progress.computed += outcome.size - len(lost)
-        progress.failed += failures(outcome) - len(lost)
+        progress.count(outcome)
+        progress.failed -= len(lost)
         if work.report:
             work.report(progress)
     rest = np.concatenate([np.empty(0, int), *uncovered])

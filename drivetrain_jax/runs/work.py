@@ -13,7 +13,7 @@ import numpy as np
 from drivetrain_jax._errors import RetryableError
 from drivetrain_jax._wording import counted
 from drivetrain_jax.analysis import OUTCOME
-from drivetrain_jax.runs.assemble import failures
+from drivetrain_jax.runs.assemble import failures, inaccurate
 from drivetrain_jax.runs.executor import Executor
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.plan import Chunk
@@ -27,12 +27,16 @@ _MOST_WAITING = 1 << 25
 
 @dataclass
 class Progress:
-    """Progress of a run: counts of results of this ``kind``, and costs in units of the plan; ``note`` is a remark."""
+    """Progress of a run: counts of results of this ``kind``, and costs in units of the plan; ``note`` is a remark.
+
+    ``failed`` points have no value, ``inaccurate`` ones a value whose error exceeds the target.
+    """
 
     total: int
     computed: int = 0
     reused: int = 0
     failed: int = 0
+    inaccurate: int = 0
     cost: float = 0.0
     total_cost: float = 0.0
     kind: str = "points"
@@ -40,6 +44,17 @@ class Progress:
 
     def __str__(self) -> str:
         return f"points: total={self.total} computed={self.computed} reused={self.reused} failed={self.failed}"
+
+    def count(self, outcome: np.ndarray) -> None:
+        """Count the failed and the inaccurate points among these outcomes."""
+        self.failed += failures(outcome)
+        self.inaccurate += inaccurate(outcome)
+
+    @property
+    def exceptions(self) -> str:
+        """The points that are no success, as the end of a line: ``, 3 failed, 2 inaccurate``."""
+        counts = ((self.failed, "failed"), (self.inaccurate, "inaccurate"))
+        return "".join(f", {count} {name}" for count, name in counts if count)
 
 
 Report = Callable[[Progress], None]
@@ -116,7 +131,7 @@ class Work:
                 points = job.plan.chunk(number - first).points
                 receiver.fill(points, results)
                 progress.reused += points.size * job.grid.path_length
-                progress.failed += failures(results[OUTCOME.name])
+                progress.count(results[OUTCOME.name])
         self._counted = True
         return np.flatnonzero(missing)
 
@@ -137,7 +152,7 @@ class Work:
                     progress.failed += count
                 else:
                     batch.add(chunk, results)
-                    progress.failed += failures(results[OUTCOME.name])
+                    progress.count(results[OUTCOME.name])
                 progress.computed += count
                 progress.cost += float(costs[chunk.number])
                 self._report(progress)

@@ -71,6 +71,22 @@ def test_run_status_run_again(cli):
     assert sorted(os.listdir()) == ["r.nc", "scene.toml"]
 
 
+@pytest.mark.parametrize(("store", "out"), [("hdf5", "r.nc"), ("zarr", "r.zarr")])
+def test_values_that_miss_their_target_are_counted(cli, store, out):
+    Path("scene.toml").write_text(SCENE.replace('analysis = "toy"', 'analysis = "loose"'))
+    remark = "drivetrain: 2 values have an error above the target (outcome tolerance_not_met)"
+    code, _, err = cli("run", "scene.toml", "--out", out, "--store", store)
+    assert (code, err[-2:]) == (0, [remark, "points: total=21 computed=21 reused=0 failed=2"])
+    assert any("21/21 points" in line and "2 failed, 2 inaccurate" in line for line in err[:-2])
+    again = cli("run", "scene.toml", "--out", out, "--store", store)
+    assert again[2] == [remark, "points: total=21 computed=0 reused=21 failed=2"]
+    assert cli("run", "scene.toml", "--out", out, "--store", store, "--quiet")[2] == again[2][1:]
+    found = json.loads(cli("status", "scene.toml", "--out", out, "--json")[1])
+    assert (found["failed"], found["inaccurate"]) == (2, 2)
+    text = cli("status", "scene.toml", "--out", out)[1]
+    assert text.endswith("2 without a value\n  not_finite: 2\n  tolerance_not_met: 2, with a value\n")
+
+
 def test_progress_then_the_last_line(cli):
     code, out, err = cli("run", "scene.toml", "--out", "r.nc")
     assert code == 0 and out == "" and err[-1] == "points: total=21 computed=21 reused=0 failed=2"

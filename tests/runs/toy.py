@@ -23,7 +23,7 @@ class Toy(System):
     title = "Toy"
     source = "nowhere"
     resonances = Resonances("a", ("b",), ("R1", "R2"), lambda v: np.stack([v["b"] * 1.0, v["b"] / 2], -1), "predicted")
-    models = {name: Model(lambda values: values, _USED) for name in ("toy", "slow", "broken", "line")} | {
+    models = {name: Model(lambda values: values, _USED) for name in ("toy", "slow", "loose", "broken", "line")} | {
         "follow": Model(
             lambda values: values, ("b", "length", "weight", "stiffness"), lambda f: _lengths_and_weights(f)
         )
@@ -95,6 +95,18 @@ def _slow_solvers(system: System, request) -> tuple[Solver, ...]:
     return (Solver("slow", solve, lambda c: 1 + c["a"], chunk=8),)
 
 
+def _loose_solvers(system: System, request) -> tuple[Solver, ...]:
+    """Values with ``a > 8`` miss their target."""
+
+    def solve(values: dict, effort) -> dict:
+        results = _solve(values, effort, request.outputs, 0.0)
+        missed = (jnp.asarray(values["a"]) > 8) & (results["outcome"] == Outcome.SUCCESS)
+        outcome = jnp.where(missed, Outcome.TOLERANCE_NOT_MET, results["outcome"])
+        return results | {"outcome": outcome.astype(jnp.int8)}
+
+    return (Solver("loose", solve, lambda c: 1 + c["a"], chunk=8),)
+
+
 def _broken_solvers(system: System, request) -> tuple[Solver, ...]:
     def solve(values: dict, effort) -> dict:
         raise RuntimeError("no luck\ntoday")
@@ -151,6 +163,7 @@ def _analysis(name: str, solvers, methods=None) -> Analysis:
 ANALYSES = {
     "toy": _analysis("toy", _solvers, {"plain": ("rtol",), "other": ("rtol", "knob"), "hopeless": ()}),
     "slow": _analysis("slow", _slow_solvers),
+    "loose": _analysis("loose", _loose_solvers),
     "broken": _analysis("broken", _broken_solvers),
     "line": Analysis(
         name="line",
