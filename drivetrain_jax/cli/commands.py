@@ -102,9 +102,11 @@ def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[An
 
 def _remarks(progress: Any) -> str:
     """The note of a finished run, and its number of inaccurate points."""
-    values = counted(progress.inaccurate, "value has", "values have")
-    inaccurate = f"{values} an error above the target (outcome tolerance_not_met)" if progress.inaccurate else ""
-    return "; ".join(filter(None, (progress.note, inaccurate)))
+    remarks = [progress.note] if progress.note else []
+    if progress.inaccurate:
+        values = counted(progress.inaccurate, "value has", "values have")
+        remarks.append(f"{values} an error above the target (outcome tolerance_not_met)")
+    return "; ".join(remarks)
 
 
 def _progress_line(quiet: bool) -> Any:

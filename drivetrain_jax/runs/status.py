@@ -88,7 +88,6 @@ def _codes(output: OutputState) -> Counter[int]:
 def _outcomes(output: OutputState) -> Iterator[np.ndarray]:
     """Outcomes of all finished points."""
     if output.state == "complete":
-        # An atlas has no points.
         yield output.outcomes
     elif output.state == "partial":
         seen, written = set[int](), set[int]()

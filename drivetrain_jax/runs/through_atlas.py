@@ -94,8 +94,7 @@ def evaluate(
         lost = np.argwhere(outcome == Outcome.LOST) + [part.start for part in block]
         uncovered.append(np.ravel_multi_index(tuple(lost.T), job.grid.shape))  # pyright: ignore[reportArgumentType]
         progress.computed += outcome.size - len(lost)
-        progress.count(outcome)
-        progress.failed -= len(lost)
+        progress.count(outcome[outcome != Outcome.LOST])
         if work.report:
             work.report(progress)
     rest = np.concatenate([np.empty(0, int), *uncovered])
