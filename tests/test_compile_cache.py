@@ -68,6 +68,7 @@ def test_calls_compile_once_for_all_processes(tmp_path):
     assert folder_used(CALL, **every) == folder and entries() == first
 
 
+@pytest.mark.full
 def test_calls_leave_a_cache_of_the_user_and_short_programs_alone(tmp_path):
     own = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "own"), "XDG_CACHE_HOME": str(tmp_path)}
     assert folder_used(CALL, **own) == str(tmp_path / "own")

@@ -16,7 +16,7 @@ from tests.oracles import complex_step
 from tests.oracles.bicardan_precise_reference import determinant
 from tests.oracles.planetary_reference import matrices
 from tests.quick_jit import quick_jit
-from tests.sizes import but_full
+from tests.sizes import but_full, full_after
 
 POINTS = 20
 CARDAN_NAMES = ("beta", "Omega", "zeta", "alpha", "mu", "gamma")
@@ -219,7 +219,13 @@ def entry(system, name):
 @pytest.mark.parametrize(
     "case",
     but_full(
-        CASES, "cardan orbit", "cardan forced", "tripod history", "rattle steady_state", "bicardan critical_speeds"
+        CASES,
+        "cardan orbit",
+        "cardan forced",
+        "tripod floquet",
+        "tripod history",
+        "rattle steady_state",
+        "bicardan critical_speeds",
     ),
 )
 def test_derivatives_at_random_points(case):
@@ -293,7 +299,7 @@ FURTHER = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", but_full(FURTHER, "condition and orbit_spectral_radius", "measures of rattle"))
+@pytest.mark.parametrize("case", full_after(1, FURTHER))
 def test_derivatives_equal_differences(case):
     """Central differences of order four."""
     function, system, names, step, rtol = FURTHER[case]
@@ -324,10 +330,14 @@ def test_both_modes_agree():
 
 
 def test_where_there_is_no_derivative_there_is_none():
-    """All multipliers on the unit circle; a parameter that splits a pair; a result that has no derivative at all."""
+    """All multipliers are on the unit circle."""
     undamped = dt.Cardan(beta=0.3, Omega=1.2, zeta=0.0, alpha=1.0, mu=1.0, gamma=100.0)
     slopes = quick_jit(jax.grad(floquet_radius))(undamped)
     assert all(np.isnan(x) for x in jax.tree.leaves(slopes))
+
+
+@pytest.mark.full
+def test_angles_that_split_a_pair_have_no_derivative():
     gear = dt.Planetary(planet_angle=(0.0, 2 * np.pi / 3, 4 * np.pi / 3))
     slopes = quick_jit(jax.jacrev(lambda s: dt.modes(s).natural_frequency[1:3]))(gear)
     assert np.isnan(slopes.planet_angle[1]).all() and np.isfinite(slopes.k_p).all()

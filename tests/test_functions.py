@@ -55,7 +55,8 @@ def replaced(system, name, value):
 
 
 @pytest.mark.parametrize(
-    "case", but_full(CASES, "cardan forced", "tripod history", "rattle steady_state", "planetary modes")
+    "case",
+    but_full(CASES, "tripod floquet", "cardan forced", "tripod history", "rattle steady_state", "planetary modes"),
 )
 def test_a_batch_equals_the_loop_and_the_sweep(case):
     function, system, name, values, rtol = CASES[case]
@@ -74,6 +75,7 @@ def test_a_batch_equals_the_loop_and_the_sweep(case):
                 np.testing.assert_allclose(one[key], lane, rtol=rtol, atol=rtol * scale)
 
 
+@pytest.mark.full
 def test_nested_batches_are_one():
     betas, speeds = jnp.linspace(0.1, 1.2, 3), jnp.linspace(0.5, 1.5, 4)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from drivetrain_jax.analysis.floquet import adjoint
 from drivetrain_jax.analysis.floquet.derivatives import monodromy
@@ -22,6 +23,7 @@ def gradients(build, values, steps, weights):
     return monodromy(build, parameters, Constants(dict.fromkeys(values)), jnp.int64(steps)).pull(weights)
 
 
+@pytest.mark.full
 def test_two_levels_of_kept_states_give_what_one_gives(monkeypatch):
     """64 steps are eight blocks; with three states on a level they become three times three."""
     build = get_system("cardan").models["floquet"].build

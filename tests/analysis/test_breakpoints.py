@@ -15,6 +15,7 @@ import drivetrain_jax as dt
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.floquet.power_series import propagators_along
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System, parameter, serves
+from tests.sizes import full_after
 
 PERIOD = 2 * math.pi
 OUTPUTS = ["floquet_multiplier", "spectral_radius", "spectral_radius_error", "verdict"]
@@ -82,7 +83,7 @@ def cases(count):
 
 
 @pytest.mark.parametrize(
-    "options", [{"method": "direct"}, {"method": "diffrax"}, {"method": "diffrax", "form": "published"}]
+    "options", full_after(2, [{"method": "direct"}, {"method": "diffrax"}, {"method": "diffrax", "form": "published"}])
 )
 def test_meissners_equation_has_its_closed_form(options):
     values = cases(24)
@@ -104,6 +105,7 @@ def test_undeclared_jumps_miss_the_tolerance():
     assert found.outcome == Outcome.TOLERANCE_NOT_MET
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("values", [(1.0, 0.6, 0.02, 0.5), (0.4, 0.9, 0.01, 0.27)], ids=["half", "other"])
 def test_derivatives_include_the_motion_of_the_jump(values):
     names = ("delta", "jump", "zeta", "duty")

@@ -379,6 +379,7 @@ def test_gradients_of_parts_that_are_independent():
     assert np.isnan(np.asarray(derivative(jnp.array([1.0, 1.0, 2.0]))[0])[:2]).all()
 
 
+@pytest.mark.full
 def test_no_derivative_where_modes_end_in_a_multiple_frequency():
     """Two equal hinged spans over rigid supports: a request for one mode must notice that the second has its frequency."""
     slope = jax.jit(jax.grad(lambda EI: angular_frequencies(spans(EI), 1)[0]))

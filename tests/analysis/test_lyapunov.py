@@ -130,6 +130,7 @@ def test_what_leaves_all_bounds_is_unstable_and_stops_nobody(linear_motions):
     assert (linear_motions["outcome"] == 0).all()
 
 
+@pytest.mark.full
 def test_what_leaves_at_once_has_no_exponents():
     """Without a value the outcome must not be a success."""
     ours = dt.run(

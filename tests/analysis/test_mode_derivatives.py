@@ -68,6 +68,7 @@ def test_against_differences(jacobian, name):
     np.testing.assert_allclose(ours[1:], exact[1:], rtol=2e-6, atol=2e-7 * np.abs(exact[1:]).max())
 
 
+@pytest.mark.full
 def test_planets_that_differ_slightly():
     """Planet modes are 1.5e-7 apart, more than the width of a cluster: each has its own value and derivative."""
     listed = tuple(1e8 * (1 + 1e-5 * x) for x in (0, 0.3, -0.5, 0.9, -0.2, 0.6))

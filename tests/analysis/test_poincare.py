@@ -42,6 +42,7 @@ def test_regular_motion_does_not_diffuse(motor):
     assert (np.abs(motor.chaos_k01) < 0.1).all()
 
 
+@pytest.mark.full
 def test_a_section_that_repeats_has_k_zero():
     """The section has five points, for which the plain test over 128 strobes gives K = 0.94."""
     scene = {"system": "tripod", "analysis": "poincare", "outputs": ["section", "chaos_k01"]}

@@ -8,6 +8,7 @@ import pytest
 
 from drivetrain_jax.analysis.floquet.radius import has_closed_form, radius_by_eigenvalues, radius_in_closed_form
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
+from tests.quick_jit import quick_jit
 
 ERROR, TOLERANCE = 1e-10, 1e-6
 
@@ -41,7 +42,7 @@ def samples(count: int = 3000) -> np.ndarray:
 
 def radii(z: jnp.ndarray, error: float = ERROR, tolerance: float = TOLERANCE) -> tuple[np.ndarray, np.ndarray]:
     lanes = z.shape[-1]
-    rho, bound = radius_in_closed_form(z, jnp.full(lanes, error), jnp.ones(lanes), tolerance)
+    rho, bound = quick_jit(radius_in_closed_form)(z, jnp.full(lanes, error), jnp.ones(lanes), tolerance)
     return np.asarray(rho), np.asarray(bound)
 
 

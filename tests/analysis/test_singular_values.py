@@ -72,9 +72,8 @@ def test_rotations_are_orthogonal_however_small_the_numbers():
     assert (np.abs(c * f + s * g - r) <= allowed).all() and (np.abs(c * g - s * f) <= allowed).all()
 
 
-@pytest.mark.parametrize(
-    "few", [pytest.param(False, id="optimised", marks=pytest.mark.full), pytest.param(True, id="few")]
-)
+@pytest.mark.full
+@pytest.mark.parametrize("few", [False, True], ids=["optimised", "few"])
 def test_coincident_values_however_it_is_compiled(few):
     """The form of a gear with twelve planets has many entries of pure rounding.
 

@@ -115,6 +115,7 @@ def test_chaos_is_non_periodic_with_its_exponent(steady):
     np.testing.assert_allclose(found["lyapunov_exponent"], [0.057, 0.097], atol=0.02)
 
 
+@pytest.mark.full
 def test_the_exponent_of_chaos_is_the_mean_growth_of_a_tangent():
     """The exponent is right even if most_periods is no multiple of 4; few periods keep rounding small."""
     case, most = TABLE1 | {"alpha": 0.0, "B1": 0.2, "omega": 1.2}, 67
@@ -327,7 +328,8 @@ def test_slow_drive_without_a_spring_in_the_gap_shows_rounding():
     assert found.outcome == Outcome.TOLERANCE_NOT_MET
 
 
-@pytest.mark.parametrize("outputs", [["impacts"], pytest.param(["impacts", "u_rms"], marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("outputs", [["impacts"], ["impacts", "u_rms"]])
 def test_every_impact_is_counted_once(outputs):
     """Impacts agree with samples of the motion, for any outputs; a few percent were once missed or counted twice."""
     scene = {"system": "rattle", "analysis": "steady_state", "fixed": TABLE1}
@@ -365,6 +367,7 @@ def test_a_motion_stops_at_a_number_of_steps_in_all(monkeypatch):
     assert stopped == 1 and 0 < periods < 300
 
 
+@pytest.mark.full
 def test_searches_count_as_steps_and_stopped_motions_are_not_measured(monkeypatch):
     """The first search is stopped, before a period has settled."""
     slow = TABLE1 | {"alpha": 0.0, "omega": 1e-3, "u0": 0.0, "v0": 0.0}

@@ -11,7 +11,7 @@ import drivetrain_jax as dt
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.frequency_response.harmonic_balance import Basis, contact, residual
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
-from tests.sizes import but_full, full_after
+from tests.sizes import but_full
 
 # So damped that every frequency has one motion; the teeth separate above 0.4 rad/s.
 GEARS = PRESETS["table1"] | {"c": 0.3, "B1": 0.0, "unbalance": 0.2}
@@ -69,7 +69,8 @@ def test_the_exact_response_is_that_of_steady_states():
                 np.testing.assert_allclose(found[name].sel(omega=omega), getattr(state, name), rtol=1e-10, err_msg=name)
 
 
-@pytest.mark.parametrize("method", full_after(1, ["exact", "harmonic_balance"]))
+@pytest.mark.full
+@pytest.mark.parametrize("method", ["exact", "harmonic_balance"])
 def test_branches_follow_the_amplitude_between_the_frequencies(method):
     """Lightly damped: the motions that the sweeps find lie on the branch, and two of them coexist somewhere."""
     found = response(

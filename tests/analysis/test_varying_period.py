@@ -11,6 +11,7 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System, parameter, serves
+from tests.quick_jit import quick_jit
 
 SPEEDS = np.array([0.05, 1.0, 1.9, 2.05, 3.1])
 OUTPUTS = ["spectral_radius", "spectral_radius_error", "floquet_multiplier"]
@@ -67,16 +68,14 @@ def test_both_clocks_have_the_same_multipliers(method, damping):
 
 
 def test_one_point_a_batch_and_the_derivative():
-    def radius(system, speed):
-        return dt.floquet(system(speed=speed)).spectral_radius
+    def radii_and_slopes(system):
+        radius = jax.value_and_grad(lambda speed: dt.floquet(system(speed=speed)).spectral_radius)
+        return quick_jit(jax.vmap(radius))(SPEEDS[1:4])
 
-    seconds, turns = (
-        jax.vmap(lambda speed, kind=kind: radius(kind, speed))(SPEEDS[1:4]) for kind in (InSeconds, InTurns)
-    )
+    (seconds, slopes), (turns, others) = radii_and_slopes(InSeconds), radii_and_slopes(InTurns)
     np.testing.assert_allclose(seconds, turns, rtol=1e-12)
-    np.testing.assert_allclose(radius(InSeconds, 2.05), turns[2], rtol=1e-12)
-    slopes = [jax.grad(lambda speed, kind=kind: radius(kind, speed))(2.05) for kind in (InSeconds, InTurns)]
-    np.testing.assert_allclose(*slopes, rtol=1e-9)
+    np.testing.assert_allclose(slopes, others, rtol=1e-9)
+    np.testing.assert_allclose(dt.floquet(InSeconds(speed=2.05)).spectral_radius, turns[2], rtol=1e-12)
 
 
 def test_a_period_that_is_not_positive_has_no_value():

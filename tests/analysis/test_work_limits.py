@@ -54,7 +54,7 @@ def assert_ends(name: str, decades: float, count: int, seed: int = 0) -> None:
             assert np.isfinite(values.where(found.outcome == Outcome.SUCCESS, 0.0)).all(), key
 
 
-@pytest.mark.parametrize("name", but_full(CASES, "adaptive section"))
+@pytest.mark.parametrize("name", but_full(CASES, "lyapunov", "poincare", "adaptive section"))
 def test_the_widest_points_end(name):
     assert_ends(name, 300, FEW)
 
@@ -86,13 +86,14 @@ LIMITS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", but_full(LIMITS, "poincare"))
+@pytest.mark.parametrize("name", but_full(LIMITS, "lyapunov", "poincare"))
 def test_a_usual_point_beyond_a_small_limit_is_not_finished(name, monkeypatch):
     module, limit, value, function, system, options = LIMITS[name]
     monkeypatch.setattr(f"drivetrain_jax.analysis.{module}.{limit}", value)
     assert function(system, **options).outcome == Outcome.STEP_LIMIT
 
 
+@pytest.mark.full
 def test_a_search_for_an_orbit_ends_at_its_limit(monkeypatch):
     monkeypatch.setattr("drivetrain_jax.analysis.forced.orbit.MAX_SEARCH", 1)
     found = dt.forced(dt.Cardan(**JOINT), outputs=["orbit_state"], rtol=4.17e-8)

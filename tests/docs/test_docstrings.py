@@ -9,11 +9,13 @@ import sys
 import pytest
 
 import drivetrain_jax as dt
+from tests.sizes import but_full
 
 EXCEPTIONS = {"ChunkError", "Incomplete", "InputError", "Interrupted"}
+NAMES = [name for name in dt.__all__ if name != "__version__" and name not in EXCEPTIONS]
 
 
-@pytest.mark.parametrize("name", [name for name in dt.__all__ if name != "__version__" and name not in EXCEPTIONS])
+@pytest.mark.parametrize("name", but_full(NAMES, "Planetary", "basins", "forced", "lyapunov", "poincare"))
 def test_examples_give_what_they_show(name):
     item = getattr(dt, name)
     scope = dict(vars(sys.modules[item.__module__]))

@@ -32,6 +32,7 @@ def commands(text: str) -> list[tuple[str, str]]:
     ]
 
 
+@pytest.mark.full
 def test_every_command_gives_the_answer_of_the_page(tmp_path, monkeypatch, capsys):
     text = PAGE.read_text()
     for name, content in re.findall(r"^```\w+\n# (\w+\.\w+)\n(.*?)^```", text, re.M | re.S):

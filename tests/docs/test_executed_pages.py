@@ -13,16 +13,14 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 SYSTEMS = [f"systems/{name}.md" for name in ("bicardan", "cardan", "planetary", "rattle", "tripod")]
+LONG = [("jax.md", 15), ("notebooks.md", 25), ("extending.md", 20), *((page, 2) for page in SYSTEMS)]
 
 
 @pytest.mark.parametrize(
     ("page", "fewest"),
     [
-        ("jax.md", 15),
-        ("notebooks.md", 25),
         ("scaling.md", 2),
-        ("extending.md", 20),
-        *(pytest.param(page, 2, marks=pytest.mark.full) for page in SYSTEMS),
+        *(pytest.param(*case, marks=pytest.mark.full) for case in LONG),
     ],
 )
 def test_the_examples_of_the_page_run(page, fewest, tmp_path, monkeypatch):

@@ -215,7 +215,7 @@ def test_a_range_of_speeds_without_extent_has_a_widest_angle():
     [
         pytest.param(1e-5, 0.894981, marks=pytest.mark.full),
         pytest.param(1e-5, 0.788523, marks=pytest.mark.full),
-        (1e-4, 0.549493),
+        pytest.param(1e-4, 0.549493, marks=pytest.mark.full),
         pytest.param(1e-4, 0.871812, marks=pytest.mark.full),
     ],
 )
@@ -389,6 +389,7 @@ def test_gradients_at_extremes(point):
         assert gradient[name] == pytest.approx(difference, rel=1e-5, abs=noise), name
 
 
+@pytest.mark.full
 def test_steps_of_a_gradient_are_found_where_the_system_predicts_none():
     model = CARDAN.models["floquet"]
     other = replace(model, build=lambda values: replace(model.build(values), explicit_steps=None))

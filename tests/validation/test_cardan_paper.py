@@ -38,12 +38,13 @@ def test_damping_destabilises():
     np.testing.assert_allclose(ds.spectral_radius, [1.0, 1.0000035, 1.00003], atol=3e-6)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("beta", "Omega", "about_orbit"),
     [
         (0.5, 0.72, 1.00023),
-        pytest.param(0.8, 1.3, 1.18959556, marks=pytest.mark.full),
-        pytest.param(0.5236, 1.416, 1.11394778, marks=pytest.mark.full),
+        (0.8, 1.3, 1.18959556),
+        (0.5236, 1.416, 1.11394778),
     ],
 )
 def test_forced_response_and_orbit(beta, Omega, about_orbit):
