@@ -62,6 +62,7 @@ STUDIES = (
     Study("peers", "cardan", "heyoka", quick=False),
     Study("batches", "cardan", quick=False),
     Study("scaling", "cardan", full=("--repeats", "1"), quick=False),
+    Study("waiting", "cardan", quick=False),
     Study("precision_bicardan", "bicardan"),
     Study("critical_speeds", "bicardan", peer_option="--ross", quick=False),
     Study("precision_planetary", "planetary"),

@@ -23,6 +23,10 @@ _SCALING = {
         "one core.",
     ),
     "cold_start": ("### Cold start of a small scene", "In seconds. `compiled code`: state of the compilation cache."),
+    "waiting": (
+        "### CPU seconds of a command",
+        "Processes with their start. `first`: without compiled code; the others find it and take new values.",
+    ),
     "overhead": ("### Overhead of the engine over its kernels", ""),
 }
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from benchmarks import page_precision, page_sections, ratio_figure
+from benchmarks import page_aims, page_precision, page_sections, ratio_figure
 from benchmarks.precision import GOAL
 from benchmarks.results_files import (
     CHART,
@@ -32,7 +32,7 @@ NAMES = (
     "throughput", "precision_cardan", "work_precision_cardan", "atlas", "heyoka", "precision_bicardan", "critical_speeds",
     "precision_planetary", "planetary_throughput", "precision_rattle", "rattle_throughput", "precision_tripod", "chaos",
     "chaos_precision", "damping", "batches", "outputs", "cold_start", "overhead", "scaling", "accelerator",
-    "precision_forced", "precision_gradients", "precision_attractors", "random_points",
+    "precision_forced", "precision_gradients", "precision_attractors", "random_points", "waiting",
 )  # fmt: skip
 _FLOWS = {"Lorenz": "Lorenz' system", "tripod": "the double tripod"}
 
@@ -62,6 +62,8 @@ def text_of(folder: Path, page: Path) -> str:
         "Speed of the package over that of its fastest rival, at equal error where errors are given below. Blue: the "
         f"package is faster; orange: slower; grey: within {ratio_figure.LEVEL - 1:.0%}; pale: no rival reaches the error.",
         "\n".join(f"- {line}" for line in conclusions(files, precise)),
+        "## Aims, met and missed",
+        page_aims.section(files, precise),
         "## The cardan chart at equal error",
         _chart_section(files["throughput"]),
         "## Work-precision and extremes",
