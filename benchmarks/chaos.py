@@ -304,7 +304,7 @@ def draw(contenders: Sequence[Contender], path: Path) -> None:
             points = [(c.per_s, c.error) for c in contenders if (c.case, c.method) == (case, method)]
             axes.loglog(*zip(*sorted(points), strict=True), label=method, **style_of(number))
         unit = "time units" if case == "Lorenz" else "strobes"
-        axes.set(xlabel=f"{unit} per second, two cores", ylabel="error of state and tangent vectors [1]", title=case)
+        axes.set(xlabel=f"{unit} per second, two cores", ylabel="relative error (root mean square)", title=case)
         axes.legend(frameon=False)
     figure.savefig(path, dpi=150)
 

@@ -34,11 +34,16 @@ _SCALING = {
 def warnings(files: Files) -> list[str]:
     """A line if the files are of several commits, and one if other programs used the machine."""
     known = {name: file.facts for name, file in files.items() if file}
-    commits = sorted({facts.get("commit", "unknown") for facts in known.values()})
+    commits: dict[str, list[str]] = {}
+    for name, facts in known.items():
+        commits.setdefault(facts.get("commit", "unknown"), []).append(name)
     loaded = [f"{name} ({load:g})" for name, facts in known.items() if (load := _other_cores(facts)) > _OTHERS]
     told = []
     if len(commits) > 1:
-        told.append(f"**Several commits**: {', '.join(commits)}.")
+        each = (
+            f"{commit} ({', '.join(names) if len(names) < 4 else 'most files'})" for commit, names in commits.items()
+        )
+        told.append(f"**Several commits**: {', '.join(each)}.")
     if loaded:
         told.append(f"**Other programs used more than {_OTHERS} cores** during: {', '.join(loaded)}.")
     return told

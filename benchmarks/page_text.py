@@ -250,8 +250,9 @@ def _accelerator_sentence(file: ResultFile | None) -> str:
         f"{row['scene']} {count(row['accelerator_per_s'])} points/s, {against(float(row['times']), 'the cores')}"
         for row in file.rows
     )
-    device = file.notes[0].partition(";")[0]
-    return f"On an accelerator ({device}), compared with all cores of its machine: {'; '.join(rates)}."
+    device, cores = file.notes[0].partition(";")[0], file.facts["machine"].rpartition(", ")[2]
+    told = f"On an accelerator ({device}), compared with the {cores} of its machine: {'; '.join(rates)}."
+    return " ".join([told, *file.notes[1:]])
 
 
 def _chart_section(file: ResultFile | None) -> str:

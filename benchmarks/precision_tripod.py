@@ -253,7 +253,7 @@ def contenders_of(name: str, quick: bool) -> list[Contender]:
     """All methods in one region."""
     found = []
     # Up to what slow excitation (128) and chaos (384) need for nine digits.
-    for steps in (12,) if quick else (6, 12, 18, 24, 40, 128, 384):
+    for steps in (12,) if quick else (6, 8, 12, 18, 24, 40, 128, 384):
         found.append(package(name, "poincare", "fixed", f"{steps} steps a strobe", {"steps": steps}, _LANES))
     # The path by diffrax compiles longest.
     for rtol in () if quick else (1e-3, 1e-9):

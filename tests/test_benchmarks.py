@@ -14,6 +14,7 @@ import pytest
 
 import drivetrain_jax
 from benchmarks import (
+    page_aims,
     page_precision,
     page_sections,
     precision_attractors,
@@ -101,13 +102,51 @@ def test_comparisons_with_the_best_rival():
     ]
 
 
+def test_aims_are_met_or_missed_as_measured():
+    def file(*rows):
+        return ResultFile("x", {}, (), rows)
+
+    chart = [
+        ("drivetrain_jax direct", 4e5, 1e-10),
+        ("heyoka batch", 2e5, 1e-10),
+        ("heyoka batch, without eigenvalues", 5e5, "nan"),
+    ]
+    damping = [
+        ("10", "package", 3.0),
+        ("10", "heyoka batch", 1.0),
+        ("100", "package", 1.0),
+        ("100", "heyoka batch", 1.05),
+    ]
+    gears = [("3", "package", 4.0), ("3", "numpy svd", 1.0), ("4", "package", 2.0), ("4", "numpy svd", 1.0)]
+    waiting = {"command": "query", "cpu_s": "0.9", "aim_s": "1", "first_cpu_s": "6", "first_aim_s": "5"}
+    files = dict.fromkeys(NAMES) | {
+        "throughput": file(*({"method": m, "cells_per_s": r, "max_error": e} for m, r, e in chart)),
+        "damping": file(*({"zeta": z, "method": m, "us_per_point": t} for z, m, t in damping)),
+        "planetary_throughput": file(*({"planets": p, "method": m, "gears_per_s": r} for p, m, r in gears)),
+        "waiting": file(waiting),
+    }
+    rungs = [
+        replace(rung(), region=region, method=method, seconds_per_point=spent)
+        for region, method, spent in (
+            ("easy", "package, direct", 1e-5), ("easy", "rival", 2e-5), ("typical", "package, direct", 2e-5),
+            ("typical", "rival", 1e-5),
+        )
+    ]  # fmt: skip
+    lines = page_aims.section(files, {"cardan": page_precision.Precision("cardan", rungs)}).splitlines()[4:]
+    found = [tuple(cell.strip() for cell in line.split("|")[2:4]) for line in lines]
+    assert found == [
+        ("2", "met"), ("0.8", "**missed**"), ("1 of 2 ahead, ratios 0.5 to 2", "**missed**"), ("0.33", "**missed**"),
+        ("1.1", "met"), ("4, 2", "**missed**"), ("0.9 s", "met"), ("6 s", "**missed**"),
+    ]  # fmt: skip
+
+
 def test_files_of_several_commits_or_of_a_loaded_machine_are_named():
     def file(commit, load):
         return ResultFile("x", {"commit": commit, "load": f"{load} cores by other programs"}, (), ())
 
     assert page_sections.warnings({"a": file("1", 0.1), "b": file("1", 0.4), "c": None}) == []
     several, loaded = page_sections.warnings({"a": file("1", 0.1), "b": file("2", 0.8)})
-    assert "1, 2" in several and "b (0.8)" in loaded and "a (" not in loaded
+    assert "1 (a), 2 (b)" in several and "b (0.8)" in loaded and "a (" not in loaded
 
 
 def test_results_name_their_commit_and_the_load_by_others():
