@@ -68,7 +68,7 @@ def known(name: str) -> dict:
     return {key: value[..., first : first + LANES] for key, value in batch("oscillators").items()}
 
 
-@pytest.mark.parametrize("name", but_full(LITERATURE, "lorenz", "roessler", "ueda", "two_wells"))
+@pytest.mark.parametrize("name", but_full(LITERATURE, "roessler", *flows.OSCILLATORS))
 def test_literature_values_within_standard_errors(name):
     """Means over independent members agree within three standard errors; literature values are rounded to 4 digits."""
     spectrum = known(name)["lyapunov_spectrum"]
@@ -77,14 +77,14 @@ def test_literature_values_within_standard_errors(name):
     assert error.max() < LARGEST_ERROR[name]
 
 
-@pytest.mark.parametrize("name", but_full(LITERATURE, "lorenz", "roessler"))
+@pytest.mark.parametrize("name", but_full(LITERATURE, "roessler", *flows.OSCILLATORS))
 def test_block_error_is_no_smaller_than_the_scatter(name):
     """The error is never much smaller than the scatter, and larger if neighbouring blocks are anticorrelated."""
     scatter = known(name)["lyapunov_spectrum"].std(axis=1, ddof=1)
     assert (np.median(known(name)["lyapunov_standard_error"], axis=1) > 0.6 * scatter).all()
 
 
-@pytest.mark.parametrize("name", but_full(LITERATURE, "lorenz", "roessler"))
+@pytest.mark.parametrize("name", but_full(LITERATURE, "roessler", *flows.OSCILLATORS))
 def test_chaos_is_recognised(name):
     """Roessler's attractor turns almost uniformly: within 1024 strobes only the third component shows its chaos."""
     kinds, k01 = known(name)["verdict"], np.median(known(name)["chaos_k01"])
@@ -92,7 +92,7 @@ def test_chaos_is_recognised(name):
     assert k01 > 0.97
 
 
-@pytest.mark.parametrize("name", but_full(LITERATURE, "lorenz", "roessler", "ueda", "two_wells"))
+@pytest.mark.parametrize("name", but_full(LITERATURE, "roessler", *flows.OSCILLATORS))
 def test_exponents_add_up_to_the_mean_divergence(name):
     assert np.abs(known(name)["sum_rule_residual"]).max() < 1e-6
 
