@@ -44,7 +44,7 @@ def diffrax():
 @pytest.fixture(scope="module")
 def sample(direct):
     """Random points, their results, and results with a tighter tolerance for comparison."""
-    points = random_points(2000, 13)
+    points = random_points(400, 13)
     return points, direct(points), direct(points, rtol=1e-13)
 
 

@@ -68,7 +68,8 @@ def known(name: str) -> dict:
     return {key: value[..., first : first + LANES] for key, value in batch("oscillators").items()}
 
 
-@pytest.mark.parametrize("name", but_full(LITERATURE, "roessler", *flows.OSCILLATORS))
+@pytest.mark.full
+@pytest.mark.parametrize("name", LITERATURE)
 def test_literature_values_within_standard_errors(name):
     """Means over independent members agree within three standard errors; literature values are rounded to 4 digits."""
     spectrum = known(name)["lyapunov_spectrum"]
@@ -77,14 +78,16 @@ def test_literature_values_within_standard_errors(name):
     assert error.max() < LARGEST_ERROR[name]
 
 
-@pytest.mark.parametrize("name", but_full(LITERATURE, "roessler", *flows.OSCILLATORS))
+@pytest.mark.full
+@pytest.mark.parametrize("name", LITERATURE)
 def test_block_error_is_no_smaller_than_the_scatter(name):
     """The error is never much smaller than the scatter, and larger if neighbouring blocks are anticorrelated."""
     scatter = known(name)["lyapunov_spectrum"].std(axis=1, ddof=1)
     assert (np.median(known(name)["lyapunov_standard_error"], axis=1) > 0.6 * scatter).all()
 
 
-@pytest.mark.parametrize("name", but_full(LITERATURE, "roessler", *flows.OSCILLATORS))
+@pytest.mark.full
+@pytest.mark.parametrize("name", LITERATURE)
 def test_chaos_is_recognised(name):
     """Roessler's attractor turns almost uniformly: within 1024 strobes only the third component shows its chaos."""
     kinds, k01 = known(name)["verdict"], np.median(known(name)["chaos_k01"])
@@ -92,7 +95,8 @@ def test_chaos_is_recognised(name):
     assert k01 > 0.97
 
 
-@pytest.mark.parametrize("name", but_full(LITERATURE, "roessler", *flows.OSCILLATORS))
+@pytest.mark.full
+@pytest.mark.parametrize("name", LITERATURE)
 def test_exponents_add_up_to_the_mean_divergence(name):
     assert np.abs(known(name)["sum_rule_residual"]).max() < 1e-6
 
@@ -146,6 +150,7 @@ def test_what_leaves_at_once_has_no_exponents():
     assert np.isnan(ours["lyapunov_spectrum"].values[1]).all() and not broken(ours)
 
 
+@pytest.mark.full
 def test_what_has_no_value_where_it_starts_is_not_left_out():
     """A point whose settling time could not be predicted was once skipped."""
     ours = tripod({"chi_n": [-0.6, 0.0026], "zeta": [0.01, 0.01]}, OUTPUTS[:1], max_time=0.02, standard_error=0.5)
@@ -361,6 +366,7 @@ def test_members_do_not_depend_on_their_neighbours(linear, linear_motions):
         np.testing.assert_array_equal(alike[name][..., 2], linear_motions[name][..., 2])
 
 
+@pytest.mark.full
 def test_limit_cycle_is_periodic():
     ours = results(flows.van_der_pol(2), OUTPUTS, 400.0, 24)
     assert (ours["verdict"] == Verdict.PERIODIC).all()
@@ -496,6 +502,7 @@ def test_no_chaos_at_the_papers_settings(controls):
     assert controls.period_multiple.values[0] == 0
 
 
+@pytest.mark.full
 def test_parametric_threshold_is_bracketed(controls):
     """The exponents are those of Floquet theory, by SciPy at 1e-12."""
     np.testing.assert_allclose(
@@ -505,6 +512,7 @@ def test_parametric_threshold_is_bracketed(controls):
     assert controls.verdict.values[1:].tolist() == kinds
 
 
+@pytest.mark.full
 def test_sum_rule_of_the_tripod(controls):
     assert np.abs(controls.sum_rule_residual).max() < 1e-7
 
@@ -588,9 +596,10 @@ KNOWN = {
     "forced torus": (lambda: flows.forced_cycle(1.0, 0.3), 300.0, Verdict.QUASI_PERIODIC, 0),
     "locked cycle": (lambda: flows.forced_cycle(3.6, 0.5), 300.0, Verdict.FIXED_POINT, 1),
     "cycle locked to every second period": (lambda: flows.forced_cycle(1.9, 0.5, 0.5), 300.0, Verdict.PERIODIC, 2),
+    "chaos": (lambda: flows.lorenz(1), 128.0, Verdict.CHAOTIC, None),
     "decay slower than exponential": (lambda: flows.algebraic(), 300.0, Verdict.UNDECIDED, None),
 }  # fmt: skip
-_SHORT = "decay to rest", "small response", "limit cycle"
+_SHORT = "decay to rest", "limit cycle", "chaos"
 
 
 @pytest.mark.parametrize("name", but_full(KNOWN, *(KNOWN.keys() - set(_SHORT))))
