@@ -109,7 +109,7 @@ def _gears(file: ResultFile | None) -> Iterator[Aim]:
 
 def _waiting(file: ResultFile | None) -> Iterator[Aim]:
     for row in file.rows if file else ():
-        for when, aim, spent in (("", "aim_s", "cpu_s"), ("first ", "first_aim_s", "first_cpu_s")):
+        for when, aim, spent in (("", "aim_s", "cpu_s"), (", first time", "first_aim_s", "first_cpu_s")):
             if row[aim]:
-                words = f"CPU of a {when}command, {row['command']}: {float(row[aim]):g} s"
-                yield Aim(words, f"{float(row[spent]):.3g} s", float(row[spent]) <= float(row[aim]))
+                wanted, took = float(row[aim]), float(row[spent])
+                yield Aim(f"CPU time{when} ({row['command']}): {wanted:g} s", f"{took:.3g} s", took <= wanted)

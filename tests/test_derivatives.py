@@ -355,6 +355,7 @@ def test_an_oscillator_at_its_ends_has_no_derivative_by_them():
     assert np.isnan(found.alpha).all() and np.isfinite(found.B1).all() and not np.any(found.u0)
 
 
+@pytest.mark.full
 def test_errors_and_codes_count_as_constants():
     slopes = jax.grad(lambda s: dt.floquet(s).spectral_radius + dt.floquet(s).spectral_radius_error)(SHAFT)
     alone = jax.grad(lambda s: dt.floquet(s).spectral_radius)(SHAFT)

@@ -294,6 +294,7 @@ def test_a_swept_entry_keeps_its_array_or_list(name):
     np.testing.assert_array_equal(found.r, [3.5, 10.0])
 
 
+@pytest.mark.full
 def test_a_chart_of_gradients():
     def slope(shaft):
         return jax.grad(lambda s: dt.floquet(s).spectral_radius)(shaft).zeta

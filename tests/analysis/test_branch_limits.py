@@ -54,6 +54,7 @@ def test_a_motion_that_cannot_be_corrected(method, module, name, monkeypatch):
     np.testing.assert_array_equal(outcome == Outcome.TOLERANCE_NOT_MET, number < [1, 3, 1])
 
 
+@pytest.mark.full
 def test_a_branch_of_too_many_steps_is_not_complete(monkeypatch):
     monkeypatch.setattr(orbit_branch, "_BUDGET", 500.0)
     np.testing.assert_array_equal(branch("exact")[1], Outcome.TOLERANCE_NOT_MET)

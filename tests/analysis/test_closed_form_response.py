@@ -21,6 +21,7 @@ from drivetrain_jax.analysis.frequency_response import (
 from drivetrain_jax.analysis.numerics.amplitude_roots import follow, refined
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
 from tests.quick_jit import quick_jit
+from tests.sizes import full_after
 
 TABLE1 = PRESETS["table1"] | {"omega": 1.0}
 MODEL = Rattle.models["basins"].build(TABLE1)
@@ -348,7 +349,7 @@ def test_peak_is_the_largest_amplitude_with_heavy_damping():
     np.testing.assert_array_equal(frequency > 0, [False] * 4 + [True] * 2)
 
 
-@pytest.mark.parametrize("case", [{}, {"alpha": 0.0}, {"alpha": 3.0, "B0": 0.0}, {"B0": 0.3}])
+@pytest.mark.parametrize("case", full_after(2, [{}, {"alpha": 0.0}, {"alpha": 3.0, "B0": 0.0}, {"B0": 0.3}]))
 def test_the_backbone_is_the_largest_free_motion(case):
     """The backbone agrees with a scan of amplitudes; it does not depend on the drive and continues beyond the peak."""
     omegas = np.array([0.3, 0.65, 0.85, 0.9, 0.99, 0.99999, 1.3])

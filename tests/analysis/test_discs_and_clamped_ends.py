@@ -256,6 +256,7 @@ def test_an_infinite_frequency_and_a_held_zero_mode_have_no_derivative():
             assert np.isnan(entry[:2]).all() if name.startswith("k_") else np.all(entry[:2] == 0), name
 
 
+@pytest.mark.full
 def test_results_obey_their_rules(tmp_path):
     """Masses swept to zero with every result asked for: `verify` finds nothing."""
     scene = {

@@ -21,6 +21,7 @@ from drivetrain_jax.analysis.forced.analysis import predicted_steps
 from drivetrain_jax.analysis.forced.orbit import integrate, shoot
 from drivetrain_jax.systems import ForcedModel, get_system
 from tests.quick_jit import quick_jit
+from tests.sizes import full_after
 
 SYSTEM = get_system("cardan")
 ANALYSIS = get_analysis("forced").for_system(SYSTEM)
@@ -359,7 +360,7 @@ def test_looser_target_is_met():
 @pytest.mark.parametrize(
     "given", [{"Omega": 1.2}, {"Omega": 2.0}, {"Omega": 0.75, "zeta": 0.0, "alpha": 0.0, "gamma": 1.0}], ids=str
 )
-@pytest.mark.parametrize("rtol", [1e-4, 1e-6])
+@pytest.mark.parametrize("rtol", full_after(1, [1e-6, 1e-4]))
 def test_stated_error_of_the_orbit_bounds_the_true_one(given, rtol):
     """The last Newton correction is no estimate of the error: it is up to 2e5 times smaller."""
     given = {"beta": 0.3} | given
@@ -373,7 +374,7 @@ def test_stated_error_of_the_orbit_bounds_the_true_one(given, rtol):
     assert stated <= rtol * np.abs(reference).max()
 
 
-@pytest.mark.parametrize("omega", [2.64, 3.0])
+@pytest.mark.parametrize("omega", full_after(1, [2.64, 3.0]))
 def test_amplitude_of_the_smaller_shaft_meets_the_target(omega):
     """This amplitude is about 30 times smaller than the other; from interpolated steps its errors were 2e-7 and 1e-8."""
     values = {k: np.float64(v) for k, v in (BASE | {"beta": 0.3, "Omega": omega}).items()}
@@ -394,6 +395,7 @@ def test_root_of_a_straight_line():
     assert inside and x == 0.5
 
 
+@pytest.mark.full
 def test_loosest_request_has_an_answer():
     values = {k: np.float64(v) for k, v in (BASE | {"beta": 0.3, "Omega": 1.2}).items()}
     found = quick_jit(lambda v: solver(("periodic_state", "orbit_state"), rtol=1e-2).solve(v, 0))(values)
@@ -405,6 +407,7 @@ def test_loosest_request_has_an_answer():
     assert np.all(np.isfinite(found["orbit_state"]))
 
 
+@pytest.mark.full
 def test_error_covers_that_of_the_second_integration():
     """A condition of 300 with a loose tolerance; reference: extrapolation of two numbers of steps in extended precision."""
     shaft = {"beta": 1.406319971883954, "Omega": 5.025357952450546, "zeta": 0.028807120682004222, "alpha": 0.0}

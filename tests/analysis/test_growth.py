@@ -94,6 +94,7 @@ def test_sum_rule_sees_a_wrong_divergence():
         np.testing.assert_allclose(sum_rule_residual(record, spectrum_of(record)), residual, atol=1e-9)
 
 
+@pytest.mark.full
 def test_marks_of_the_compiler_change_rounding_only(monkeypatch):
     """A short march of Lorenz' system agrees with and without the marks.
 

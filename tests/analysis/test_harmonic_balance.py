@@ -19,6 +19,7 @@ from drivetrain_jax.analysis.frequency_response.harmonic_sweep import settle
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
 from tests.quick_jit import quick_jit
+from tests.sizes import full_after
 
 TABLE1 = PRESETS["table1"]
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "rattle.json").read_text())
@@ -186,7 +187,7 @@ def test_one_harmonic_is_the_describing_function():
         assert np.nanmin(distance, axis=1).max() < 2e-9
 
 
-@pytest.mark.parametrize("samples", [63, 100])
+@pytest.mark.parametrize("samples", full_after(1, [63, 100]))
 def test_any_number_of_samples(samples):
     omegas = np.array([0.7, 0.9])
 
@@ -251,7 +252,7 @@ def test_a_lane_does_not_depend_on_the_others():
         np.testing.assert_array_equal(value[..., 0], others[name][..., 0], err_msg=name)
 
 
-@pytest.mark.parametrize("harmonics", [1, 2])
+@pytest.mark.parametrize("harmonics", full_after(1, [1, 2]))
 def test_what_lies_between_two_folds_is_a_saddle(harmonics):
     """The motion is a saddle even if disturbances with few harmonics decay, in agreement with the describing function."""
     omegas = np.linspace(0.65, 0.95, 31)

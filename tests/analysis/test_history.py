@@ -105,7 +105,7 @@ def test_long_memory_meets_the_target(rtol):
         ("Dopri8", 12e3, 1e-5, 0.2),
         ("Dopri8", 20e3, 1e-7, 0.2),
         ("Tsit5", 40e3, 1e-5, 0.1),
-        ("Kvaerno5", 60e3, 1e-4, 0.1),
+        pytest.param("Kvaerno5", 60e3, 1e-4, 0.1, marks=pytest.mark.full),
     ],
 )
 def test_errors_of_strobes_of_one_step_are_told(solver, frequency, rtol, end):

@@ -55,7 +55,7 @@ def test_a_response_and_its_branch():
         ("multiple_scales", {}, ["peak_frequency", "fold_frequency"]),
         ("multiple_scales", {"fit_range": 1.0}, ["peak_frequency", "fold_frequency"]),
         ("describing_function", {}, ["peak_frequency", "fold_frequency"]),
-        ("harmonic_balance", {"harmonics": 3}, []),
+        pytest.param("harmonic_balance", {"harmonics": 3}, [], marks=pytest.mark.full),
     ],
 )
 def test_an_approximate_response(method, options, own, size):

@@ -259,6 +259,7 @@ def exact_shape(v: Mapping, p: float, x: np.ndarray) -> np.ndarray:
         return np.array([float(f / max(shape, key=abs)) for f in shape])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", WEAK)
 def test_shapes_of_weakly_coupled_parts(name):
     """Parts that hardly move, or are at rest, are accurate to the rounding of the largest deflection."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from drivetrain_jax.analysis.numerics.kernels import _operations
 from drivetrain_jax.analysis.numerics.staged import staged
@@ -39,6 +40,7 @@ def test_same_numbers_and_nothing_twice():
     assert sorted(array.shape for array in split.fixed) == [(1, LANES), (2,)]
 
 
+@pytest.mark.full
 def test_inside_a_trace_and_under_differentiation():
     def total(beta, mu):
         split = staged(entries(beta, mu), TIMES)

@@ -150,6 +150,7 @@ def test_a_lane_alone_is_the_lane_in_its_batch(steady):
         np.testing.assert_array_equal(values[..., 0], together[name][..., 4], name)
 
 
+@pytest.mark.full
 def test_underdamped_motions_have_a_faster_solver_with_the_same_results(steady):
     """Without a spring in the gap, or with strong damping, the solver for oscillating free motion does not apply."""
     names = ("u_max", "u_min", "spectral_radius", "period_multiple")
@@ -307,6 +308,7 @@ def test_a_motion_far_smaller_than_the_gap_has_its_extremes():
     assert found.u_rms == pytest.approx(exact / math.sqrt(2), rel=1e-10, abs=0)
 
 
+@pytest.mark.full
 def test_transition_matrix_changes_at_the_flank():
     """Stiff contacts after long flights amplify the delay of each step at a flank; reference: 128-bit Taylor series.
 

@@ -82,6 +82,7 @@ def test_branches_follow_the_amplitude_between_the_frequencies(method):
     assert np.isfinite(found.branch_u_max.values).sum(axis=1).max() > 1
 
 
+@pytest.mark.full
 def test_the_residual_knows_its_slope_along_the_frequency():
     model = Rattle(omega=0.7, **GEARS).along_frequencies()
     basis = Basis(3, 1, 0)

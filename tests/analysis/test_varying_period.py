@@ -67,6 +67,7 @@ def test_both_clocks_have_the_same_multipliers(method, damping):
     assert (error < 1e-8 * turns["spectral_radius"] + 1e-300).all()
 
 
+@pytest.mark.full
 def test_one_point_a_batch_and_the_derivative():
     def radii_and_slopes(system):
         radius = jax.value_and_grad(lambda speed: dt.floquet(system(speed=speed)).spectral_radius)

@@ -320,6 +320,7 @@ def test_limits_without_damping_allow_for_a_loose_atlas():
     assert limiting.sum() > 500 and (~limiting).sum() > 100
 
 
+@pytest.mark.full
 def test_the_gradient_of_a_tip():
     """At a tip the radius does not vary along the speed, so that ``d beta/d mu = -rho_mu/rho_beta``."""
     atlas = cardan_atlas({"beta": (0.0, 0.7), "Omega": (0.65, 1.5), "mu": (1.0, 1.1)}, 1e-12).atlas

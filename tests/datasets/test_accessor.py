@@ -111,6 +111,7 @@ def test_results_that_are_joined(chart):
     assert caption(plain) == "" and r"$\zeta$ = 0.001" in caption(chart)
 
 
+@pytest.mark.full
 def test_the_caption_of_a_part_of_an_atlas(tmp_path):
     axes = ATLAS["axes"] | {"zeta": {"start": 0.0, "stop": 0.01}}
     fixed = {name: value for name, value in SHAFT.items() if name != "zeta"}

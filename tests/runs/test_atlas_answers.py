@@ -104,6 +104,7 @@ def test_an_answer_in_rpm_says_how_fast_disturbances_grow():
     assert without.keys() == {"per_turn", "turns_to_double"}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("axes", [("Omega", "beta", "mu"), ("mu", "beta", "Omega"), ("beta", "mu", "Omega")])
 def test_tiles_lie_along_the_longest_axes_of_a_chart(monkeypatch, axes):
     """A chart may have few values of the last two parameters of its atlas; tiles must not become small by that."""
@@ -175,6 +176,7 @@ def test_a_chart_searches_its_tips_once(monkeypatch):
     assert np.isfinite(drawn["boundary_beta"]).sum() == length
 
 
+@pytest.mark.full
 def test_every_slice_of_a_chart_has_its_own_curve():
     axes = {"beta": (0.05, 0.3), "alpha": (0.5, 4.0), "Omega": (1.35, 1.48)}
     scene = {"axes": {name: {"start": low, "stop": high} for name, (low, high) in axes.items()}}
@@ -227,6 +229,7 @@ def test_an_undecided_range_that_hides_a_change_ends_a_window(rtol, beta):
     assert atlas.radius({"beta": np.full(speeds.size, beta), "Omega": speeds, **columns(speeds.size)}).max() < 1
 
 
+@pytest.mark.full
 def test_the_nearest_change_next_to_an_undecided_range():
     atlas = atlas_of((0.0, 1.3), (0.15, 2.0), rtol=1e-5)
     below = atlas_answers.query(atlas, {"beta": 0.894981, "Omega": 0.752}).data["nearest"]["Omega"]["below"]
@@ -259,6 +262,7 @@ def test_an_answer_without_a_value_states_if_it_is_certain():
     assert "\n  no beta of the atlas is sufficient" in str(none) and none.data["certain"]
 
 
+@pytest.mark.full
 def test_stable_intervals_away_from_the_safe_end_are_listed():
     """At beta = .9 a tongue covers all speeds; it closes at 1.144."""
     atlas = atlas_of((0.9, 1.45), (0.5, 0.6), zeta=0.01, gamma=1.0)

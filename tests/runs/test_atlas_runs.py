@@ -26,6 +26,7 @@ from drivetrain_jax.runs.run import Incomplete, Interrupted, run_to_file
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.store.consolidate import write_result
 from tests.labels import labelled
+from tests.sizes import full_after
 
 BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 ENDS = " allowed is start and stop"
@@ -258,7 +259,7 @@ def test_labelled_arrays_keep_their_labels_and_must_agree(atlas):
         atlas(beta=beta, Omega=xr.DataArray([1.1, 1.2], dims="shaft", coords={"shaft": ["b", "c"]}))
 
 
-@pytest.mark.parametrize("outputs", [["floquet_multiplier", "verdict"], ["spectral_radius"]])
+@pytest.mark.parametrize("outputs", full_after(1, [["floquet_multiplier", "verdict"], ["spectral_radius"]]))
 def test_an_atlas_without_a_panel_has_all_its_points_solved(monkeypatch, tmp_path, outputs):
     monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
     scene = floquet("atlas") | {"outputs": outputs}

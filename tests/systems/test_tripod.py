@@ -202,6 +202,7 @@ def radius_and_slopes(chi_n, frequency, zeta):
     return jax.value_and_grad(radius, argnums=(0, 1))(chi_n, frequency)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("case", REFERENCE["critical_chi_n"], ids=lambda case: str(case["zeta"]))
 def test_least_chi_n_that_makes_the_element_unstable(case):
     """At the tip of the principal tongue the radius is 1, and largest over the frequency; errors are Newton steps."""
