@@ -127,7 +127,7 @@ def test_folds_and_peak_are_at_frequencies_of_a_drive():
     assert found["peak_amplitude"][0, 0] == pytest.approx(np.nanmax(found["branch_u_max"][..., 0]), rel=1e-4)
 
 
-@pytest.mark.parametrize("alpha", [0.0, 0.1, 0.15, 0.2, 0.3])
+@pytest.mark.parametrize("alpha", full_after(2, [0.0, 0.2, 0.1, 0.15, 0.3]))
 def test_the_largest_self_consistent_range_is_taken(alpha):
     """The range agrees with a dense scan from large ranges down, also where two ranges nearly merge."""
     for ratio in (0.01, 0.4, 0.55, 0.65, 0.68, 0.69, 0.71, 0.72, 0.8, 0.9, 0.95):
@@ -336,6 +336,7 @@ def test_limits_without_drive_damping_or_stiffness(scales, describing):
     assert np.isnan(describing["fold_frequency"][0, 1:, 5]).all()
 
 
+@pytest.mark.full
 def test_peak_is_the_largest_amplitude_with_heavy_damping():
     """Without a resonance the amplitude falls from its static value at the frequency 0, B1/k' for a linear spring."""
     cases = ({"alpha": 1.0, "c": 1.9}, {"alpha": 1.0, "c": 2.5}, {"c": 1.5}, {"alpha": 0.0, "B0": 0.0, "c": 3.0})

@@ -107,6 +107,7 @@ CROSSING = {
 CROSSING_RADIUS = np.array([2.19580758985809508e-18, 1.0515487833445584448e-44, 6.8701943106188223541e-16])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("rtol", [1e-7, 1e-10, 1e-12])
 def test_bound_counts_rounding_that_grows_on_the_way(direct, rtol):
     """One mode survives the first half of the span, another one the second half: rounding grows 1e4 times in between."""

@@ -237,6 +237,7 @@ def test_error_beyond_the_target_is_reported(point):
     assert result["periodic_state_error"] > 1e-10 * np.abs(result["periodic_state"]).max()
 
 
+@pytest.mark.full
 def test_lost_orbit_keeps_the_linear_response(point, monkeypatch):
     """The orbit needs several corrections, so a limit of one correction loses it."""
     monkeypatch.setattr(orbit, "MAX_CORRECTIONS", 1)
@@ -347,6 +348,7 @@ def test_lanes_that_wait_take_no_steps():
     assert calls_of_both / 2 < 1.1 * sum(n for n, _ in alone)
 
 
+@pytest.mark.full
 def test_looser_target_is_met():
     values = {k: np.float64(v) for k, v in (BASE | {"beta": 0.8, "Omega": 1.3}).items()}
     loose, sharp = quick_jit(lambda v: solver(LINEAR, rtol=1e-5).solve(v, 0))(values), linear_only(values)
@@ -374,6 +376,7 @@ def test_stated_error_of_the_orbit_bounds_the_true_one(given, rtol):
     assert stated <= rtol * np.abs(reference).max()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("omega", full_after(1, [2.64, 3.0]))
 def test_amplitude_of_the_smaller_shaft_meets_the_target(omega):
     """This amplitude is about 30 times smaller than the other; from interpolated steps its errors were 2e-7 and 1e-8."""

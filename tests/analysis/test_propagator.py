@@ -27,6 +27,7 @@ from drivetrain_jax.analysis.numerics import dop853
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
 from drivetrain_jax.analysis.numerics.radau import radau_iia
 from drivetrain_jax.systems import LinearPeriodic
+from tests.sizes import full_after
 
 SPAN = 2.0
 
@@ -139,7 +140,7 @@ def test_growth_of_what_is_made_on_the_way():
     assert expected > 100
 
 
-@pytest.mark.parametrize("n", [1, 4])
+@pytest.mark.parametrize("n", full_after(1, [4, 1]))
 def test_constant_coefficients(n):
     a = 2 * np.random.default_rng(n).standard_normal((n, n))
     expected = expm(a)
@@ -261,6 +262,7 @@ def test_bound_holds_for_stiff_systems_without_a_determinant(rates):
     assert bound < 60 * np.finfo(float).eps * float(stiffness_of(system)) * exact
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("steps", [24, 30, 48])
 def test_a_fourfold_coarser_solution_tells_the_same_error(steps):
     """The estimates from coarser solutions with a half and a quarter of the steps hold and agree."""

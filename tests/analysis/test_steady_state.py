@@ -298,6 +298,7 @@ def test_a_flank_is_passed_however_gently(drive, above):
     assert found.spectral_radius == pytest.approx(0.91111675664, abs=1e-9)
 
 
+@pytest.mark.full
 def test_a_motion_far_smaller_than_the_gap_has_its_extremes():
     outputs = ["u_max", "u_min", "u_rms"]
     found = dt.point(

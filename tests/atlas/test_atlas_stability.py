@@ -329,6 +329,7 @@ def test_worst_cells_against_precise_values(chart):
     assert compared.violations == compared.wrong == 0 and 0 < compared.ratio < 1
 
 
+@pytest.mark.full
 def test_the_attack_finds_bounds_that_are_too_narrow(chart, monkeypatch):
     """Violations are counted for bounds a millionth as wide and inverted verdicts, and none for the true ones."""
     case, size = CASES[0], Size(60, 40, 1)

@@ -50,6 +50,7 @@ def test_the_atlas_agrees_with_the_determinant_of_the_paper(atlas):
     assert power == pytest.approx(np.full(3, round(power[0])), abs=1e-6)
 
 
+@pytest.mark.full
 def test_zeros_of_the_atlas_are_the_natural_frequencies(atlas):
     stiffness = np.array([1e5, 2e7, 1e10])
     expected = np.asarray(find_roots(shaft(jnp.array(stiffness)), 4).q) ** 2

@@ -297,8 +297,8 @@ def test_systems_are_found_by_name():
     [
         ({"beta": 1.0, "Omega": 0.1, "zeta": 10.0}, 1e-9),
         ({"beta": 0.5, "Omega": 0.1, "zeta": 3.0}, 1e-7),
-        ({"beta": 1.4, "Omega": 0.1, "zeta": 3.0}, 1e-11),
-        ({"beta": 1.0, "Omega": 0.02, "zeta": 10.0}, 1e-5),
+        pytest.param({"beta": 1.4, "Omega": 0.1, "zeta": 3.0}, 1e-11, marks=pytest.mark.full),
+        pytest.param({"beta": 1.0, "Omega": 0.02, "zeta": 10.0}, 1e-5, marks=pytest.mark.full),
         ({"beta": 0.8, "Omega": 0.5, "zeta": 0.0}, 1e-9),
     ],
 )
