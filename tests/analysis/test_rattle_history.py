@@ -194,3 +194,21 @@ def test_averaging_gives_the_equations_of_multiple_scales():
 def test_refusals(given, said):
     with pytest.raises(dt.InputError, match=said):
         dt.history(dt.Rattle(**GEARS), times=[1.0], **given)
+
+
+def test_an_oscillator_far_faster_than_its_drive_is_not_begun():
+    """It made a batch wait for hours: the contact's fastest rate is 1e14, and a period lasts 7 s."""
+    fast = {"B0": 88.0, "B1": 0.0, "b": 2e-13, "c": 3e7, "alpha": 2e8, "k": 3e-15, "I": 0.64, "omega": 0.9, "u0": -1e3}
+    found = exact(fast, [5.0, 10.0])
+    assert found.outcome == Outcome.STEP_LIMIT and np.isnan(found.u).all()
+
+
+@pytest.mark.parametrize("omega", [1e-9, 1e-15, 1e-200])
+def test_a_short_part_of_a_long_period_is_computed(omega):
+    """The drive stands still. The least step was a part of its period, and carried the motion over contacts."""
+    times = [1.0, 5.0, 10.0, 20.0]
+    found = exact(GEARS | {"omega": omega}, times, ["u", "event_count"])
+    options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14, "max_step": 0.02}
+    other = solve_ivp(field(GEARS | {"omega": 0.0}), (0, 20), (0.5, 0.5), t_eval=times, **options)
+    assert found.outcome == Outcome.SUCCESS and found.event_count == 10
+    np.testing.assert_allclose(found.u, other.y[0], atol=1e-9)

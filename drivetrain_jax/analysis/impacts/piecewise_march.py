@@ -27,7 +27,7 @@ from drivetrain_jax.analysis.impacts.piecewise_flow import (
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 from drivetrain_jax.systems.trigonometry import sincos
 
-# Least step: ratio to the shortest time scale, and to the period (rounding of the time).
+# Least step: ratio to the shortest time scale, and to the latest time in a period (its rounding).
 _LEAST_STEP, _LEAST_PART = 1e-12, 1e-15
 # Longest step, as a phase of the drive.
 _LONGEST_PHASE = 1.5
@@ -55,12 +55,16 @@ class Lanes(NamedTuple):
     least: Array
 
 
-def prepare(oscillator: PiecewiseLinearOscillator) -> Lanes:
-    """Constants of the lanes. Without backlash the position of the flanks is negative and contact is permanent."""
+def prepare(oscillator: PiecewiseLinearOscillator, span: float = np.inf) -> Lanes:
+    """Constants of the lanes for a motion over the time ``span``.
+
+    Without backlash the position of the flanks is negative and contact is permanent.
+    """
     stiffness, b = jnp.asarray(oscillator.stiffness), jnp.asarray(oscillator.b)
     contact, gap = piece(oscillator, stiffness), piece(oscillator, oscillator.alpha * stiffness)
     period = jnp.asarray(oscillator.period)
-    least = jnp.maximum(_LEAST_STEP / jnp.maximum(contact.rate, gap.rate), _LEAST_PART * period)
+    latest = jnp.minimum(period, span)
+    least = jnp.maximum(_LEAST_STEP / jnp.maximum(contact.rate, gap.rate), _LEAST_PART * latest)
     lanes = Lanes(
         contact,
         gap,
@@ -242,14 +246,18 @@ def few_steps(lanes: Lanes, motion: Motion) -> Motion:
     return jax.lax.fori_loop(0, FEW, lambda _, moving: step(lanes, moving), motion)
 
 
-def usual_steps(lanes: Lanes) -> Array:
-    """Number of steps that no drive period exceeds (measured: 5 per oscillation, up to 15 per crossing)."""
-    return 2000 + 100 * lanes.period * jnp.maximum(lanes.contact.rate, lanes.gap.rate) / (2 * np.pi)
+def usual_steps(lanes: Lanes, span: float = np.inf) -> Array:
+    """Number of steps that no drive period exceeds (measured: 5 per oscillation, up to 15 per crossing).
+
+    A motion over the time ``span`` has no longer period than that.
+    """
+    period = jnp.minimum(lanes.period, span)
+    return 2000 + 100 * period * jnp.maximum(lanes.contact.rate, lanes.gap.rate) / (2 * np.pi)
 
 
-def allowed_steps(lanes: Lanes) -> Array:
+def allowed_steps(lanes: Lanes, span: float = np.inf) -> Array:
     """:func:`usual_steps`, or 0 where that is so much that the motion is not begun."""
-    steps = usual_steps(lanes)
+    steps = usual_steps(lanes, span)
     return jnp.where(steps <= _MOST_STEPS, steps, 0.0)
 
 

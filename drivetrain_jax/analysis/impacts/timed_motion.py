@@ -13,11 +13,11 @@ from drivetrain_jax.analysis.impacts.piecewise_march import (
     Lanes,
     Motion,
     advance,
+    allowed_steps,
     locate,
     next_step,
     prepare,
     start,
-    usual_steps,
 )
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
@@ -48,13 +48,15 @@ def timed_motion(
 ) -> tuple[Array, Array, Events, Array]:
     """Displacement and velocity ``(T, N)`` at the rising ``times``, the first ``most_events`` events, and flags ``(N,)``.
 
-    The motion starts in the state ``(u, v)`` at t = 0. A flag marks a lane that needed too many steps, which only a grazing
-    motion does. Times are counted in whole periods and a fraction, so that the phase of the drive does not drift.
+    The motion starts in the state ``(u, v)`` at t = 0. A flag marks a lane that needs too many steps: a grazing motion, or
+    one whose oscillator is so much faster than its drive that it is not begun. Times are counted in whole periods and a
+    fraction, so that the phase of the drive does not drift.
     """
-    lanes = jax.tree.map(lambda x: x + jnp.zeros(u.shape), prepare(oscillator))
+    lanes = jax.tree.map(lambda x: x + jnp.zeros(u.shape), prepare(oscillator, times[-1]))
     turns = jnp.asarray(times)[:, None] / lanes.period
     periods = jnp.floor(turns).astype(jnp.int32)
-    most = 2 * (periods[-1] + 1) * usual_steps(lanes) + 2 * len(times)
+    allowed = allowed_steps(lanes, times[-1])
+    most = jnp.where(allowed > 0, 2 * (periods[-1] + 1) * allowed + 2 * len(times), 0)
     none = jnp.full((most_events, *u.shape), jnp.nan)
     nothing = Events(none, jnp.full(none.shape, NO_EVENT, jnp.int8), none, jnp.zeros(u.shape, jnp.int32))
 
