@@ -240,9 +240,10 @@ def test_error_beyond_the_target_is_reported(point):
 @pytest.mark.full
 def test_lost_orbit_keeps_the_linear_response(point, monkeypatch):
     """The orbit needs several corrections, so a limit of one correction loses it."""
-    monkeypatch.setattr(orbit, "MAX_CORRECTIONS", 1)
     solve = quick_jit(lambda v: solver(("periodic_state", "orbit_state", "orbit_state_error")).solve(v, 0))
-    result = solve({k: np.float64(v) for k, v in (BASE | {"beta": 0.5, "Omega": 0.72}).items()})
+    with monkeypatch.context() as patch:
+        patch.setattr(orbit, "MAX_CORRECTIONS", 1)
+        result = solve({k: np.float64(v) for k, v in (BASE | {"beta": 0.5, "Omega": 0.72}).items()})
     assert result["outcome"] == Outcome.NOT_CONVERGED
     assert np.all(np.isnan(result["orbit_state"])) and np.isnan(result["orbit_state_error"])
     expected = point(beta=0.5, Omega=0.72)["periodic_state"]
