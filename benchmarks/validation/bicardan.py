@@ -99,7 +99,8 @@ def influences() -> dict[str, str]:
     changes |= {"short": {"length": tuple(0.9 * x for x in soft["length"])}, "thick": _thicker(1.1)}
     shafts = {name: solve({**soft, **change}, base, modes=2) for name, change in changes.items()}
     n = {name: found.critical_speed.values for name, found in shafts.items()}
-    shapes = {name: found.mode_shape.values[0] / found.mode_shape.values[0][0] for name, found in shafts.items()}
+    first = {name: shafts[name].mode_shape.values[0] for name in ("soft", "stiff")}
+    shapes = {name: shape / shape[0] for name, shape in first.items()}
 
     def change(name: str, mode: int) -> str:
         return f"{n[name][mode] / n['soft'][mode] - 1:+.2%}"
