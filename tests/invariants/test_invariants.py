@@ -127,6 +127,7 @@ def test_rules_of_the_analyses(analysis, variables, rule):
             {"lyapunov_spectrum": real([[0.2]], "exponent"), "lyapunov_standard_error": real([[np.nan]], "exponent")},
         ),
         ("lyapunov", 1, {"lyapunov_spectrum": real([[0.2]], "exponent"), "sum_rule_residual": real([5.0])}),
+        ("lyapunov", 0, {"lyapunov_spectrum": real([[0.0]], "exponent"), "sum_rule_residual": real([1e-18])}),
         ("floquet", 3, {"floquet_multiplier": real(np.empty((1, 0)), "multiplier")}),
     ],
 )
