@@ -208,10 +208,14 @@ def explore(options: argparse.Namespace) -> int:
 
 
 def _reading(*files: Path) -> ExitStack:
-    """A context in which errors of readers are errors of these files."""
+    """A context in which errors of readers are errors of these files; on a terminal it shows that the command works."""
     from drivetrain_jax.store import gate
 
     stack = ExitStack()
+    if sys.stderr.isatty():
+        from drivetrain_jax.cli.progress import working_on
+
+        stack.enter_context(working_on(", ".join(file.name for file in files)))
     for file in files:
         stack.enter_context(gate.reading(file))
     return stack

@@ -1,4 +1,4 @@
-"""Progress of a run on standard error: points done, rate and time left."""
+"""Progress on standard error: points done, rate and time left of a run; elapsed time of other commands."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
 from drivetrain_jax._errors import InputError
@@ -49,3 +49,14 @@ def progress_line() -> Iterator[Callable[[Progress], None]]:
     finally:
         if bar.live.is_started:
             bar.stop()
+
+
+@contextmanager
+def working_on(text: str) -> Iterator[None]:
+    """Show a moving sign, ``text`` and the time on standard error, and remove them at the end."""
+    columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
+    console = Console(stderr=True)
+    # Answers must go to standard output even while the sign is shown.
+    with Bar(*columns, console=console, transient=True, redirect_stdout=False, redirect_stderr=False) as bar:
+        bar.add_task(text, total=None)
+        yield

@@ -16,6 +16,7 @@ import xarray as xr
 
 from drivetrain_jax import ChunkError, InputError, __version__
 from drivetrain_jax.cli import main
+from drivetrain_jax.cli.commands import _reading
 from drivetrain_jax.cli.progress import progress_line
 from drivetrain_jax.runs.work import Progress
 from drivetrain_jax.systems import get_system
@@ -114,6 +115,18 @@ def test_no_bar_beside_the_line_of_wrong_input(capsys):
         report(Progress(total=21))
         raise InputError("dask = 'tcp://nowhere:1': no scheduler answers there")
     assert capsys.readouterr().err == ""
+
+
+def test_a_terminal_shows_what_is_worked_on(capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "xterm")
+    with _reading(Path("atlas.nc")):
+        print("the answer")
+    found = capsys.readouterr()
+    assert found.out == "the answer\n" and "atlas.nc" in found.err
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: False)
+    with _reading(Path("atlas.nc")):
+        assert capsys.readouterr().err == ""
 
 
 def test_set_replaces_entries(cli):
