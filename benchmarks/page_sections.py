@@ -150,7 +150,7 @@ def peers(files: Files, images: str, told: Mapping[str, str]) -> list[str]:
 
 _NOT_MEASURED = (
     "NLDESA (Mathieu charts in JAX) needs NumPy below 1.25 and SciPy below 1.11, with which this package does not run. CAPD "
-    "(validated integration in C++) is not to be had as a Python package."
+    "(validated integration in C++) is not available as a Python package."
 )
 
 

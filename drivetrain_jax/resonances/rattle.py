@@ -28,6 +28,6 @@ THRESHOLD = Resonances(
     ("no separation ends",),
     rattle_threshold,
     "amplitude at which the orbit without separation ends",
-    # The amplitude is not B1 alone then.
+    # An unbalance adds to the amplitude B1 of the drive.
     without=("unbalance",),
 )

@@ -80,7 +80,7 @@ def _ahead(x: np.ndarray, size: np.ndarray, places: list[tuple[int, int]], i: in
 
 
 def _gap(size: float, likely: tuple[float, float]) -> float:
-    """Relative difference from the nearer of the ``likely`` sizes; 0 between two without a size.
+    """Relative difference of ``size`` from the nearer of the ``likely`` sizes; 0 if neither attractor has a size.
 
     Both sizes count, because the straight line overshoots near a peak.
     """

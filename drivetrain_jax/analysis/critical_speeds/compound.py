@@ -19,9 +19,8 @@ Count (Wittrick & Williams 1971). Natural frequencies below p: ``N = sum J0 + ne
 the block elimination of the dynamic stiffness from left to right. J0 counts the clamped-clamped frequencies of a
 segment. The pivot of the node in front of a segment is ``D = S + K``; its inertia follows from two signs that the
 propagation has at hand, ``sgn det D = sgn(u0 u0' Q)`` and the sign of its trace; that of a joint is ``S22 + k_hinge``,
-which is negative if u0 changes its sign there. At a pole the signs of u0 and of Q may be anything, but each enters
-twice, so that the total is right: there is no frequency at which the count fails, and its parity is the sign of Psi by
-construction.
+which is negative if u0 changes its sign there. At a pole the signs of u0 and of Q are not determined. Each enters twice, so
+the total is right at every frequency, and its parity is the sign of Psi.
 """
 
 from __future__ import annotations
