@@ -9,7 +9,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet $(addprefix -c ,$(CONSTRAINT
 
 .PHONY: atlas test validate faults versions lint bench validation gallery docs help clean
 
-atlas: $(VENV)/installed  ## the quickstart atlas and its figure, in out/
+atlas: $(VENV)/installed  ## the quickstart chart and its figure, in out/
 	@mkdir -p $(OUT)
 	$(BIN)/drivetrain run sweeps/quickstart.toml --out $(OUT)/quickstart.nc
 	$(BIN)/drivetrain plot $(OUT)/quickstart.nc --out $(OUT)/quickstart.png
