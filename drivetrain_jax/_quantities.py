@@ -97,14 +97,18 @@ class Parameter:
         return self._check_number(value, self.name)
 
     def _check_number(self, value: object, label: str) -> float | int:
+        written = isinstance(value, str)
         if isinstance(value, str):
             value = self._in_units(value, label)
         elif isinstance(value, Decimal) or (isinstance(value, Real) and not isinstance(value, (bool, int, float))):
             value = float(value)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise ValueError(f"{label} = {shown(value)}: allowed is a number, {self.allowed}")
+        if isinstance(value, int) and value.bit_length() > 1024:
+            raise ValueError(f"{label}: an integer of {value.bit_length()} bits; allowed is {self.allowed_in_units}")
         if not self._is_within(value) or (self.integer and value != int(value)):
-            raise ValueError(f"{label} = {value!r}: allowed is {self.allowed_in_units}{self._meant(value)}")
+            guess = "" if written else self._meant(value)
+            raise ValueError(f"{label} = {value!r}: allowed is {self.allowed_in_units}{guess}")
         if value > self.usual:
             usual = f"more than {self.usual:g} {self.units}"
             warnings.warn(f'{label} = {value:.10g} {self.units}: {usual}; is "{value:.10g} mm" meant?', stacklevel=2)
@@ -181,6 +185,11 @@ class Variable:
     dtype: str = "float64"
     flags: tuple[str, ...] = ()
     lower: float | None = None
+
+    @property
+    def missing(self) -> float | int:
+        """The value that marks a missing result: NaN, the last code of flags (undecided, none), or 0 of other integers."""
+        return len(self.flags) - 1 if self.flags else 0 if self.dtype.startswith(("int", "uint")) else math.nan
 
     def written(self, value: Any) -> str:
         """One value as text: the meaning of a code, twelve digits of a number, three digits of an error."""

@@ -84,6 +84,23 @@ def number(text: str, units: str) -> float:
     return value * factor(unit, units)
 
 
+def with_unit(value: Any) -> Any:
+    """``value`` as texts such as ``"18 deg"`` if it brings a unit, as a coordinate or a quantity of pint does."""
+    unit = getattr(value, "attrs", {}).get("units") if hasattr(value, "attrs") else getattr(value, "units", None)
+    unit = "" if unit is None else str(unit)
+    if unit in ("", "1", "dimensionless"):
+        return getattr(value, "magnitude", value)
+    # Local import: the command line starts without NumPy.
+    import numpy as np
+
+    numbers = np.asarray(getattr(value, "magnitude", value))
+    return _texts(numbers.tolist(), unit) if numbers.dtype.kind in "iuf" else value
+
+
+def _texts(numbers: Any, unit: str) -> Any:
+    return [_texts(each, unit) for each in numbers] if isinstance(numbers, list) else f"{numbers!r} {unit}"
+
+
 @lru_cache(maxsize=256)
 def factor(unit: str, units: str) -> float:
     """The number of ``units`` that one ``unit`` is. Raises :class:`UnitError` as :func:`number` does."""

@@ -165,8 +165,8 @@ def _concrete(job: _Job, parameters: Any) -> dict[str, Array]:
     index = int(np.argmin(costs))
     if not np.isfinite(costs[index]):
         shapes = jax.eval_shape(_pure(job), parameters)
-        lost = {name: jnp.full(x.shape, jnp.nan if x.dtype.kind in "fc" else 0, x.dtype) for name, x in shapes.items()}
-        return lost | {OUTCOME.name: jnp.full_like(lost[OUTCOME.name], Outcome.STEP_LIMIT)}
+        missing = {v.name: v.missing for v in job.analysis.variables} | {OUTCOME.name: Outcome.STEP_LIMIT}
+        return {name: jnp.full(x.shape, missing[name], x.dtype) for name, x in shapes.items()}
     return _compiled(job, index)(parameters, np.int64(np.ceil(efforts[index])))
 
 

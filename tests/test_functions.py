@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
-from drivetrain_jax.analysis import OUTCOME, get_analysis
+from drivetrain_jax.analysis import OUTCOME, Outcome, get_analysis
 from drivetrain_jax.analysis.floquet import propagator
 from drivetrain_jax.analysis.request import make_request
 from drivetrain_jax.runs import kernel
@@ -236,6 +236,17 @@ def declared(units="1", roles=(), model=None, **serving):
         (lambda: dt.sweep(len, SHAFT, over={"name": [1.0]}), "over.name: unknown to a Cardan.*; allowed is beta, Omega, "),
         (lambda: dt.sweep(abs, 1.0, over={"a": [0.0, 1.0]}), "system: got a float; allowed is a pytree"),
         (lambda: dt.sweep(lambda p: {"a": p["a"]}, {"a": 1.0}, over={"a": [1.0]}), "over: 'a' names two dimensions"),
+        (lambda: swept(lambda p: {"r/s": p["a"]}), "returns a result 'r/s'; allowed is another name, without /"),
+        (lambda: swept(lambda p: {"checksums": p["a"]}), "returns a result 'checksums'; allowed is another name"),
+        (lambda: swept(lambda p: {"": p["a"]}), "returns a result ''; allowed is another name"),
+        (lambda: swept(lambda p: {"r": jax.random.key(0)}), "returns 'r' as key.*; allowed is float64, for example"),
+        (lambda: dt.sweep(len, {"outcome": 1.0}, over={"outcome": [0.0]}), "over.outcome: the name of a result"),
+        (lambda: swept(len, {"a": [True, False]}), r"over.a: got \[True, False\]; allowed are numbers"),
+        (lambda: swept(len, {"a": np.ma.masked_equal([0.0, 1.0], 1.0)}), "over.a: got .*; allowed are numbers"),
+        (lambda: dt.Cardan(beta=np.ma.masked, Omega=1.4, **BASE), "beta: a masked value; allowed are numbers"),
+        (lambda: dt.Cardan(beta=1 << 2000, Omega=1.4, **BASE), "beta: an integer of 2001 bits; allowed is"),
+        (lambda: dt.sweep(dt.floquet, dt.Cardan(beta=0.1, Omega=jnp.ones(2), **BASE), over={"beta": [0.1]}),
+            r"Omega: an array of the shape \(2,\); allowed is a number, or Omega in over"),
     ],
 )  # fmt: skip
 def test_wrong_input_is_one_line(call, message):
@@ -281,6 +292,28 @@ def test_any_function_is_swept_resumed_and_refused(tmp_path):
     with pytest.raises(dt.InputError, match="system = 'function': known only to the script"):
         dt.sweep(dt.floquet, SHAFT, over={"beta": [0.1]}, out=out)
     assert dt.sweep(one(2.0), pytree, over=over, out=out, fresh=True).root[1, 1] == 12.0
+
+
+def test_a_result_without_end_is_no_result_and_codes_are_known():
+    found = swept(lambda p: {"r": 1 / p["a"], "n": jnp.int32(3)})
+    assert np.isnan(found.r[0]) and found.r[1] == 2.0 and found.n.values.tolist() == [3, 3]
+    assert found.outcome.values.tolist() == [Outcome.NOT_FINITE, Outcome.SUCCESS]
+    coded = swept(lambda p: {"r": p["a"], "outcome": jnp.where(p["a"] > 0, 300, 2)})
+    assert coded.outcome.values.tolist() == [2, Outcome.NOT_FINITE]
+
+
+@pytest.mark.parametrize("number", [np.float64, np.float32, np.array, jnp.array, jnp.float32])
+def test_fixed_values_may_be_numbers_of_numpy_and_jax(number):
+    shaft = dt.Cardan(beta=number(0.25), Omega=1.5, **{name: number(value) for name, value in BASE.items()})
+    found = dt.sweep(dt.floquet, shaft, over={"Omega": [1.5, 1.75]}, outputs=["spectral_radius"])
+    assert "\nbeta = 0.25\n" in found.attrs["scene"]
+    assert found.spectral_radius[0] == pytest.approx(float(dt.floquet(shaft).spectral_radius), rel=1e-12)
+
+
+def test_a_point_without_result_is_not_stable():
+    """Its verdict is undecided: the code 0 would say that it is stable."""
+    lost = dt.floquet(dt.Cardan(beta=0.3, Omega=1e-300, zeta=0.1, alpha=1.0, mu=1.0, gamma=1e9), method="direct")
+    assert lost.outcome == Outcome.STEP_LIMIT and np.isnan(lost.spectral_radius) and lost.verdict == 2
 
 
 @pytest.mark.parametrize("name", ["k[1]", "l[1]"])

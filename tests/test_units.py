@@ -7,7 +7,9 @@ import subprocess
 import sys
 
 import numpy as np
+import pint
 import pytest
+import xarray as xr
 
 import drivetrain_jax as dt
 from drivetrain_jax._quantities import Parameter
@@ -100,6 +102,28 @@ def test_a_sweep_takes_units():
     assert chart.beta.values.tolist() == [math.radians(9), math.radians(18)] and chart.beta.attrs["units"] == "rad"
     doubled = dt.sweep(lambda s: 2 * s.beta, shaft, over={"beta": ["9 deg", 0.1]})
     assert doubled.beta.values.tolist() == [math.radians(9), 0.1]
+
+
+@pytest.mark.parametrize(
+    "bring",
+    [
+        lambda values: xr.DataArray(values, attrs={"units": "deg"}),
+        lambda values: pint.application_registry.Quantity(values, "deg"),
+        lambda values: pint.UnitRegistry().Quantity(values, "degree"),
+    ],
+)
+def test_values_bring_their_units(bring):
+    """A coordinate of a dataset and a quantity of pint are not taken for numbers in the unit of the parameter."""
+    one, two = bring(9.0), bring(np.array([9.0, 18.0]))
+    shaft = dt.Cardan(beta=one, Omega=1.4, **BASE)
+    assert shaft.beta == math.radians(9)
+    expected = [math.radians(9), math.radians(18)]
+    assert dt.Cardan(beta=two, Omega=1.4, **BASE).beta.tolist() == expected
+    swept = dt.sweep(dt.floquet, shaft, over={"beta": two}, outputs=["verdict"])
+    scene = {"system": "cardan", "analysis": "floquet", "axes": {"beta": two}, "outputs": ["verdict"]}
+    run = dt.run(scene | {"fixed": {"Omega": 1.4, **BASE}})
+    assert swept.beta.values.tolist() == run.beta.values.tolist() == expected
+    assert dt.point("cardan", "floquet", beta=one, Omega=1.4, **BASE).parameters["beta"] == expected[0]
 
 
 def test_degrees_without_a_unit_are_refused_with_a_question():

@@ -146,10 +146,7 @@ def inaccurate(outcome: np.ndarray) -> int:
 
 def missing_value(variable: Variable) -> float | int:
     """The value that marks a missing result of ``variable``."""
-    if variable.name == OUTCOME.name:
-        return Outcome.STEP_LIMIT
-    # Integers have no NaN: a flag uses its last code (undecided, none).
-    return len(variable.flags) - 1 if variable.flags else 0 if np.dtype(variable.dtype).kind in "iu" else np.nan
+    return Outcome.STEP_LIMIT if variable.name == OUTCOME.name else variable.missing
 
 
 def dimension_sizes(scene: Scene, grid: Grid) -> dict[str, int]:

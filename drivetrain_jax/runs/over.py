@@ -5,12 +5,11 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
@@ -20,11 +19,13 @@ from jax import Array
 from drivetrain_jax import analyses, functions
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax._units import with_unit
 from drivetrain_jax._wording import nearest, shown
 from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analysis_names
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.analysis.request import checked
 from drivetrain_jax.runs.axes import Axis, AxisTable, entry_of, spread
+from drivetrain_jax.runs.replaced import replaced
 from drivetrain_jax.runs.run import run
 from drivetrain_jax.runs.scene import FUNCTION, Scene
 from drivetrain_jax.systems import Model, System, get_system, system_names
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 _CHUNK = 256
 # The fixed word that identifies what a function computes.
 _COMPUTES = "computes"
+# Names that files can store, and names that they use themselves.
+_STORED_NAME, _RESERVED = re.compile(r"(?!\.{1,2}$)[^/\x00-\x1f]+"), ("checksums", "provenance")
 
 
 def sweep(
@@ -101,30 +104,44 @@ def _scene_table(
         )
     # An empty list stands for a default of none.
     conversions = system.physical.conversions if system.physical else ()
-    replaced = {*over, *(each.parameter for each in conversions if each.needs[0] in over)}
-    fixed = {key: _plain(value) for key, value in system.values.items() if key not in replaced and value != ()}
+    given = {*over, *(each.parameter for each in conversions if each.needs[0] in over)}
+    kept = {key: value for key, value in system.values.items() if key not in given and not _is_empty(value)}
+    fixed = {key: _plain(key, value, system.parameter(key).listed) for key, value in kept.items()}
     axes = {key: value if isinstance(value, Mapping) else {"values": _row(key, value)} for key, value in over.items()}
     table = {"system": system.name, "analysis": name, "axes": axes, "fixed": fixed, "options": dict(options)}
     return table if outputs is None else table | {"outputs": [outputs] if isinstance(outputs, str) else list(outputs)}
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return [_plain(entry) for entry in value]
-    return value if isinstance(value, str) else float(value)
+def _is_empty(value: Any) -> bool:
+    return isinstance(value, tuple) and not value
+
+
+def _plain(name: str, value: Any, listed: bool) -> Any:
+    """A fixed value as a scene has it."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, tuple) or (listed and np.ndim(value) == 1):
+        return [_plain(f"{name}[{i}]", entry, False) for i, entry in enumerate(value)]
+    if np.ndim(value):
+        raise InputError(f"{name}: an array of the shape {np.shape(value)}; allowed is a number, or {name} in over")
+    return float(value)
 
 
 def _row(name: str, values: Any) -> list[Any]:
     """Numbers, and texts such as ``"18 deg"``, which the scene converts."""
+    values = with_unit(values)
     written = isinstance(values, (list, tuple)) and any(isinstance(value, str) for value in values)
     return list(values) if written else _numbers(name, values)
 
 
 def _numbers(name: str, values: Any) -> list[float]:
     try:
-        array = np.asarray(values, float)
-    except (TypeError, ValueError):
-        raise InputError(f"over.{name}: got {values!r}; allowed are numbers") from None
+        given = np.asarray(values)
+        if given.dtype.kind in "bcM" or np.ma.is_masked(values):
+            raise TypeError(given.dtype)
+        array = given.astype(float)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"over.{name}: got {shown(values)}; allowed are numbers") from None
     if array.ndim != 1 or not array.size:
         raise InputError(
             f"over.{name}: got an array of the shape {array.shape}; allowed is one of the shape (N,), N >= 1"
@@ -144,6 +161,8 @@ def _function_scene(
         raise InputError(f"system: got a {type(system).__name__}; allowed is a pytree, such as a dict of numbers")
     known = {p.name: p for p in system.parameters} if isinstance(system, System) else {}
     values = {}
+    if OUTCOME.name in over:
+        raise InputError(f"over.{OUTCOME.name}: the name of a result; allowed is another name")
     for name, given in over.items():
         described = known.get(entry_of(name)[0], Parameter(name, "1", name))
         scalar = replace(described, name=name, listed=False, broadcast=False)
@@ -152,7 +171,7 @@ def _function_scene(
     name = re.sub(r"\W", "_", getattr(function, "__name__", "function")).strip("_") or "value"
 
     def one(point: Mapping[str, Any]) -> dict[str, Array]:
-        return _named(function(_replaced(system, point), **options), name)
+        return _named(function(replaced(system, point), **options), name)
 
     example = {key: jax.ShapeDtypeStruct((), float) for key in values}
     traced, shapes = jax.make_jaxpr(one, return_shape=True)(example)
@@ -204,9 +223,7 @@ def _kind(
         del effort
         found = one.call({key: values[key] for key in varies})
         results = {v.name: found[v.name].astype(v.dtype) for v in variables}
-        finite = [jnp.all(jnp.isfinite(x)) for x in results.values() if jnp.issubdtype(x.dtype, jnp.inexact)]
-        state = jnp.where(jnp.all(jnp.array([True, *finite])), Outcome.SUCCESS, Outcome.NOT_FINITE).astype(jnp.int8)
-        return results | {OUTCOME.name: found.get(OUTCOME.name, state).astype(jnp.int8)}
+        return _with_outcome(results, found.get(OUTCOME.name))
 
     def solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
         return (Solver(name, over_lanes(solve), chunk=_CHUNK),)
@@ -231,6 +248,17 @@ def _kind(
     return type("Function", (System,), body), analysis
 
 
+def _with_outcome(results: Mapping[str, Array], code: Array | None) -> dict[str, Array]:
+    """``results`` and their outcome: the code of the function, or success if all are finite; otherwise all are NaN."""
+    if code is not None:
+        known = (code >= 0) & (code <= max(Outcome))
+        return {**results, OUTCOME.name: jnp.where(known, code, Outcome.NOT_FINITE).astype(jnp.int8)}
+    inexact = {name for name, x in results.items() if jnp.issubdtype(x.dtype, jnp.inexact)}
+    finite = jnp.all(jnp.array([True, *(jnp.all(jnp.isfinite(results[name])) for name in inexact)]))
+    state = jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE).astype(jnp.int8)
+    return {n: jnp.where(finite, x, jnp.nan) if n in inexact else x for n, x in results.items()} | {OUTCOME.name: state}
+
+
 def _variable(name: str, shape: jax.ShapeDtypeStruct) -> Variable:
     dtype = "int8" if shape.dtype == bool else str(shape.dtype)
     return Variable(name, "1", name, tuple(f"{name}_{i}" for i in range(len(shape.shape))), dtype)
@@ -247,6 +275,10 @@ def _named(result: Any, name: str) -> dict[str, Array]:
         except (TypeError, ValueError):
             given = f"a {type(value).__name__}" + (f" as {key!r}" if named is result else "")
             raise InputError(f"function: returns {given}; allowed is an array or a flat dict of arrays") from None
+        if not _STORED_NAME.fullmatch(str(key)) or key in _RESERVED:
+            raise InputError(f"function: returns a result {key!r}; allowed is another name, without /")
+        if getattr(found[str(key)].dtype, "kind", "V") not in "biufc":
+            raise InputError(f"function: returns {key!r} as {found[str(key)].dtype}; allowed is float64, for example")
     return found
 
 
@@ -279,58 +311,3 @@ def _check_outcome(shapes: Mapping[str, jax.ShapeDtypeStruct]) -> None:
             f"outcome: the function returns {given.dtype} of the shape {given.shape}; allowed is one integer, "
             f"a code of the outcome from 0 to {max(Outcome)}, or another name"
         )
-
-
-def _replaced(system: Any, point: Mapping[str, Any]) -> Any:
-    """``system`` with these parameters, keys or attributes, or entries of them, replaced."""
-    for name, value in point.items():
-        base, entry = entry_of(name)
-        if base not in (names := _names(system)):
-            raise InputError(f"over.{name}: unknown to a {type(system).__name__}{nearest(base, names)}")
-        old = system[base] if isinstance(system, Mapping) else getattr(system, base)
-        if entry is not None:
-            value = _with_entry(old, entry, value, name)
-        elif not (isinstance(system, System) and system.parameter(base).is_number):
-            _check_number(old, name)
-        if isinstance(system, Mapping):
-            system = {**system, base: value}
-        else:
-            system = eqx.tree_at(lambda s, base=base: getattr(s, base), system, value, is_leaf=lambda x: x is None)
-    return system
-
-
-def _names(system: Any) -> list[str]:
-    """Names of the keys, fields or attributes of a pytree."""
-    if isinstance(system, Mapping):
-        return list(system)
-    if is_dataclass(system):
-        return [field.name for field in fields(system)]
-    return list(getattr(system, "_fields", getattr(system, "__dict__", ())))
-
-
-def _with_entry(old: Any, entry: int, value: Array, name: str) -> Any:
-    """``old``, an array, list or tuple, with one number replaced."""
-    base = entry_of(name)[0]
-    if not _is_listed(old):
-        raise InputError(f"over.{name}: {base} is not a list; allowed is {base}")
-    if entry >= len(old):
-        allowed = f"allowed is {base}[0] to {base}[{len(old) - 1}]" if len(old) else f"{base} is empty"
-        raise InputError(f"over.{name}: {allowed}")
-    _check_number(old[entry], name)
-    if isinstance(old, (list, tuple)):
-        return eqx.tree_at(lambda entries: entries[entry], old, value, is_leaf=lambda x: x is None)
-    return jnp.asarray(old, jnp.result_type(old, value)).at[entry].set(value)
-
-
-def _is_listed(value: Any) -> bool:
-    return isinstance(value, (list, tuple)) or getattr(value, "ndim", 0) > 0
-
-
-def _check_number(old: Any, name: str) -> None:
-    """Check that a number in the place of ``old`` keeps the structure of the pytree."""
-    listed = _is_listed(old)
-    if old is None or (jax.tree_util.all_leaves([old]) and not listed and not isinstance(old, str)):
-        return
-    kind = "an array" if hasattr(old, "ndim") else f"a {type(old).__name__}"
-    allowed = f'one entry, for example "{name}[0]"' if listed and name == entry_of(name)[0] else "a number"
-    raise InputError(f"over.{name}: {kind} cannot vary as a whole; allowed is {allowed}")

@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._units import with_unit
 from drivetrain_jax._wording import nearest, shown
 from drivetrain_jax.runs import shipped
 from drivetrain_jax.store.files import read_regular
@@ -90,6 +91,7 @@ def plain(value: Any) -> Any:
     """A copy in the types of TOML: NumPy numbers and arrays, tuples and ranges become numbers and lists."""
     if isinstance(value, Mapping):
         return {key: plain(entry) for key, entry in value.items()}
+    value = with_unit(value)
     if hasattr(value, "tolist"):
         return value.tolist()
     if isinstance(value, (Decimal, Fraction)):

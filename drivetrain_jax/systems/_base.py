@@ -26,7 +26,7 @@ from jax import Array
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._printing import printed
 from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
-from drivetrain_jax._units import is_unit
+from drivetrain_jax._units import is_unit, with_unit
 from drivetrain_jax._wording import meant, nearest
 from drivetrain_jax.resonances import Resonances, Values
 from drivetrain_jax.systems._flow import Flow
@@ -284,6 +284,8 @@ def _admitted(described: Parameter, value: Any) -> Any:
         return None
     if described.choices or described.text:
         return _checked(described, value)
+    if described.listed and not described.broadcast and isinstance(value, (np.ndarray, jax.Array)) and value.ndim == 1:
+        value = value if isinstance(value, jax.core.Tracer) else value.tolist()
     if described.listed and isinstance(value, (list, tuple)):
         each = replace(described, listed=False)
         return tuple(_number(replace(each, name=f"{each.name}[{i}]"), entry) for i, entry in enumerate(value))
@@ -291,6 +293,11 @@ def _admitted(described: Parameter, value: Any) -> Any:
 
 
 def _number(described: Parameter, value: Any) -> Any:
+    value = with_unit(value)
+    if isinstance(value, list):
+        return np.array([_number(described, entry) for entry in value])
+    if np.ma.is_masked(value):
+        raise InputError(f"{described.name}: a masked value; allowed are numbers, {described.allowed_in_units}")
     if isinstance(value, jax.core.Tracer) or not hasattr(value, "dtype"):
         # A placeholder of a transformation, such as a shape, is no number either.
         return _checked(described, value) if isinstance(value, _DATA) or hasattr(value, "columns") else value

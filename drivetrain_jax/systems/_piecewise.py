@@ -51,7 +51,8 @@ class PiecewiseLinearOscillator(eqx.Module):
     @property
     def oscillates(self) -> Any:
         """True where free motion is underdamped in contact and within the play."""
-        return (self.damping / 2) ** 2 < self.stiffness * jnp.minimum(1.0, self.alpha)
+        with np.errstate(over="ignore"):
+            return (self.damping / 2) ** 2 < self.stiffness * jnp.minimum(1.0, self.alpha)
 
     @property
     def period(self) -> Any:

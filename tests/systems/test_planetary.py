@@ -133,6 +133,7 @@ def test_one_of_five_planets_3_degrees_off():
     """By the exact label nearly all modes are coupled; the dominant family and its share characterise them."""
     angles = tuple(np.radians([0, 75, 144, 216, 288]))
     found = dt.modes(dt.Planetary(planet_angle=angles))
+    assert dt.Planetary(planet_angle=np.array(angles)).planet_angle == tuple(angles)
     coupled = np.asarray(found.mode_type) == 4
     assert coupled.sum() == 17
     families = np.bincount(found.dominant_family[coupled], minlength=4)
