@@ -77,7 +77,7 @@ def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None)
     lines += ["nearest change of stability"] if nearest or not panels.panels else []
     lines += [] if panels.panels else [f"  unknown: the atlas has no panel ({panels.gaps[0].reason})"]
     lines += [line for each in nearest for line in _nearest_lines(asked, each)]
-    compared, forced = forced_at(atlas, amplitude, point, results.get("spectral_radius"))
+    compared, forced = forced_at(atlas, amplitude, point, results.get("verdict"))
     lines += compared
     data = {
         "system": atlas.scene.system.name,
@@ -121,7 +121,7 @@ def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range], amplit
     speed, damping = roles_of(atlas, "speed", "damping")
     asked = AtlasQuery.of(atlas, given, ranges=(speed,), free=(damping,))
     answer = design.least_damping(
-        atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.radius
+        atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.direct
     )
     return _answered("least damping", "from {} on", "largest", asked, answer, amplitude)
 
@@ -134,7 +134,7 @@ def widest_angle(atlas: StoredAtlas, given: Mapping[str, float | Range], amplitu
     speed, angle = roles_of(atlas, "speed", "angle")
     asked = AtlasQuery.of(atlas, given, ranges=(speed,), free=(angle,))
     answer = design.widest_angle(
-        atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.radius
+        atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.direct
     )
     return _answered("widest angle", "up to {}", "smallest", asked, answer, amplitude)
 
@@ -148,7 +148,7 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
     asked = AtlasQuery.of(atlas, given, ranges=(), free=(speed,), within=(speed,))
     panels = atlas.stability.atlas
     part = narrow(panels, {speed: asked.values[speed]}) if speed in asked.values else panels
-    found = design.speed_windows(part, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.radius)
+    found = design.speed_windows(part, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.direct)
     compared, forced = forced_over(atlas, amplitude, [w.safe for w in found.windows], asked.numbers(), asked.named)
     lines, sensitivities = [f"safe speeds, {asked.heading()}, margin {margin:g}"], []
     for k, w in enumerate(found.windows):

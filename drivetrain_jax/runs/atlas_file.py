@@ -290,12 +290,12 @@ class StoredAtlas:
         """The request of the ``floquet`` analysis: its outputs and options."""
         return Request(self.scene.request.outputs, "atlas", self.scene.request.options)
 
-    def radius(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Spectral radii ``(N,)`` by direct solves, without the panels; ``columns`` holds all parameters.
+    def direct(self, columns: Mapping[str, np.ndarray], result: str = "spectral_radius") -> np.ndarray:
+        """Values ``(N,)`` of a result by direct solves, without the panels; ``columns`` holds all parameters.
 
         Raises :class:`ChunkError` if a solve fails.
         """
-        return self._solved(columns, "floquet", Request(("spectral_radius",), "direct", self.scene.request.options))
+        return self._solved(columns, "floquet", Request((result,), "direct", self.scene.request.options))
 
     def amplitude(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """Amplitudes ``(N, displacements)`` of the forced motion by direct solves; ``columns`` holds all parameters."""

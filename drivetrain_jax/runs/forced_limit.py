@@ -52,13 +52,22 @@ class Limit:
         """An amplitude as text, in the unit of the limit."""
         return f"{amplitude * _units.factor(self.own, self.units):.6g} {self.units}"
 
-    def at_point(self, amplitudes: np.ndarray, radius: float) -> tuple[str, dict[str, Any]]:
-        """The amplitudes at one point with this spectral radius, and whether they are within the limit: text and data."""
-        within = bool(np.max(amplitudes) <= self.value and radius <= 1)
+    def at_point(self, amplitudes: np.ndarray, verdict: int) -> tuple[str, dict[str, Any]]:
+        """The amplitudes at one point with this verdict, and whether they are within the limit: text and data.
+
+        ``within`` is None if that is undecided.
+        """
+        known, unstable, undecided = bool(np.all(np.isfinite(amplitudes))), verdict == 1, verdict == 2
+        above = known and bool(np.max(amplitudes) > self.value)
+        within = None if not known or (undecided and not above) else not (above or unstable)
         each = ", ".join(f"{name} {self.written(a)}" for name, a in zip(self.names, amplitudes, strict=True))
-        verdict = "within" if within else "unstable: the motion grows beyond" if radius > 1 else "above"
-        data = {"amplitude": dict(zip(self.names, map(float, amplitudes), strict=True)), "limit": self.value}
-        return f"{each}; {verdict} the limit of {self.written(self.value)}", data | {
+        compared = "unstable: the motion grows beyond" if unstable else "above" if above else "within"
+        doubt = " if the motion is stable, which is undecided" if within is None else ""
+        values = [float(a) if np.isfinite(a) else None for a in amplitudes]
+        text = f"{each}; {compared} the limit of {self.written(self.value)}{doubt}" if known else "no value"
+        return text, {
+            "amplitude": dict(zip(self.names, values, strict=True)),
+            "limit": self.value,
             "units": self.own,
             "within": within,
         }
@@ -152,14 +161,14 @@ def forced_along(atlas: Any, limit: Limit, ends: tuple[float, float], at: Mappin
     return limit.along(amplitude, *ends, likely)
 
 
-def forced_at(atlas: Any, amplitude: Any, point: Mapping[str, float], radius: Any) -> tuple[list[str], dict[str, Any]]:
+def forced_at(atlas: Any, amplitude: Any, point: Mapping[str, float], verdict: Any) -> tuple[list[str], dict[str, Any]]:
     """The comparison of a stored atlas with a limit at one ``point``, as lines and as data; empty without a limit."""
     if amplitude is None:
         return [], {}
     limit = Limit.of(atlas.scene.system, amplitude)
     columns = {name: np.array([value]) for name, value in point.items()}
-    radius = atlas.radius(columns)[0] if radius is None else radius
-    text, data = limit.at_point(atlas.amplitude(columns)[0], float(radius))
+    verdict = atlas.direct(columns, "verdict")[0] if verdict is None else verdict
+    text, data = limit.at_point(atlas.amplitude(columns)[0], int(verdict))
     return [f"forced amplitude: {text}"], {"forced": data}
 
 

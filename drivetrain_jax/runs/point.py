@@ -67,9 +67,11 @@ class PointResult:
         return self.values[name]
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("_") or name not in self.values:
-            raise AttributeError(f"no result {name!r}; there is {', '.join(self.values)}")
-        return self.values[name]
+        # A copy asks before it has any attribute.
+        values = vars(self).get("values", {})
+        if name not in values:
+            raise AttributeError(f"no result {name!r}; there is {', '.join(values)}")
+        return values[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.values)
@@ -119,7 +121,8 @@ class PointResult:
             lines.append(f"  from {', '.join(data)}")
         for name in plain:
             text = _text(self.variables[name], self.values[name])
-            hint = f" ({self.advice})" if self.advice and text.startswith("undecided ") else ""
+            near = self.advice and self.outcome.has_value and text.startswith("undecided ")
+            hint = f" ({self.advice})" if near else ""
             lines.append(f"  {name:{width}} = {_with_units(text, self.variables[name].units)}{hint}")
         lines += growth_lines(self.growth, width)
         hint = f" ({self.remedy})" if self.remedy and self.outcome == Outcome.NOT_CONVERGED else ""
@@ -221,7 +224,7 @@ def point(
         from drivetrain_jax.runs.sensitivities import gradient_lines, point_sensitivities
 
         data = {name: value for name, (value, _) in found.physical.items()}
-        effects = point_sensitivities(job.scene.system, found.parameters, data)
+        effects = point_sensitivities(job.scene.system, found.parameters, data) if found.outcome.has_value else None
         found = replace(found, sensitivities=effects or [], _effects=gradient_lines(effects))
     return found if amplitude is None else replace(found, forced=_forced(found, given, amplitude))
 
@@ -231,10 +234,10 @@ def _forced(found: PointResult, given: Mapping[str, Any], amplitude: Any) -> tup
     system = system_and_analysis(found.system, found.analysis)[0]
     limit, parameters = Limit.of(system, amplitude), {n: x for n, x in given.items() if n in described(system)}
     known = dict(found.values)
-    for analysis, name in (("forced", "amplitude"), ("floquet", "spectral_radius")):
+    for analysis, name in (("forced", "amplitude"), ("floquet", "verdict")):
         if name not in known:
             known[name] = point(found.system, analysis, outputs=[name], **parameters)[name]
-    return limit.at_point(known["amplitude"], float(known["spectral_radius"]))
+    return limit.at_point(known["amplitude"], int(known["verdict"]))
 
 
 def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dict[str, Any]:

@@ -70,7 +70,7 @@ def test_boundaries_lie_on_both_sides_of_the_angle_0():
     below, above = nearest["below"]["value"], nearest["above"]["value"]
     assert below == pytest.approx(-above, rel=1e-12) and -0.2 < below < -0.15
     beside = [below - 1e-6, below + 1e-6, above - 1e-6, above + 1e-6]
-    rho = atlas.radius({"beta": np.array(beside), "Omega": np.full(4, 1.42), **columns(4)})
+    rho = atlas.direct({"beta": np.array(beside), "Omega": np.full(4, 1.42), **columns(4)})
     assert (rho > 1).tolist() == [True, False, False, True]
     ends = atlas_answers.query(atlas, {"beta": 0.25, "Omega": 1.42}).data["nearest"]["beta"]
     assert ends["below"]["value"] == pytest.approx(above, rel=1e-12) and ends["above"] is None
@@ -227,7 +227,7 @@ def test_an_undecided_range_that_hides_a_change_ends_a_window(rtol, beta):
     windows = atlas_answers.speed_windows(atlas, {"beta": beta}).data["windows"]
     speeds = np.concatenate([np.linspace(*window["safe"], 41)[1:-1] for window in windows])
     assert len(windows) >= 5 and all(window["check"]["agrees"] for window in windows)
-    assert atlas.radius({"beta": np.full(speeds.size, beta), "Omega": speeds, **columns(speeds.size)}).max() < 1
+    assert atlas.direct({"beta": np.full(speeds.size, beta), "Omega": speeds, **columns(speeds.size)}).max() < 1
 
 
 @pytest.mark.full

@@ -60,6 +60,22 @@ def test_an_unstable_motion_is_never_within_a_limit(capsys):
     assert "driven 2.67463 deg; unstable: the motion grows beyond the limit of 80 deg" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("amplitude", "verdict", "within", "text"),
+    [
+        (0.01, 0, True, "within the limit of 2 deg"),
+        (0.01, 1, False, "unstable: the motion grows beyond the limit of 2 deg"),
+        (0.01, 2, None, "within the limit of 2 deg if the motion is stable, which is undecided"),
+        (0.05, 2, False, "above the limit of 2 deg"),
+        (math.nan, 0, None, "no value"),
+    ],
+)
+def test_what_is_not_known_is_not_within_a_limit(amplitude, verdict, within, text):
+    said, data = TWO.at_point(np.array([0.0, amplitude]), verdict)
+    assert data["within"] is within and said.endswith(text)
+    assert json.loads(json.dumps(data, allow_nan=False)) == data
+
+
 def test_limits_that_mean_nothing_are_refused(capsys):
     for words, message in (
         ([*WORDS, "speed=2000", "--amplitude", "2"], 'did you mean "2 deg"?'),

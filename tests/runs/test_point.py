@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import json
+import pickle
 import re
 
 import numpy as np
@@ -97,6 +99,14 @@ def test_failed_point_says_so():
     result = dt.point("toy", "toy", a=9.5)
     assert np.isnan(result.value) and not result.outcome.has_value and "not_finite" in repr(result)
     assert json.loads(result.to_json())["values"]["value"] == {"value": None, "units": "m"}
+
+
+def test_a_result_can_be_copied_and_pickled():
+    result = dt.point("toy", "toy", a=1.0)
+    for again in (pickle.loads(pickle.dumps(result)), copy.deepcopy(result), copy.copy(result)):
+        assert again.value == result.value and repr(again) == repr(result)
+    with pytest.raises(AttributeError, match="no result 'valu'; there is value"):
+        result.valu  # noqa: B018
 
 
 def test_json():

@@ -93,6 +93,14 @@ def test_undecided_says_what_to_do():
     assert "a smaller rtol than 1e-10 may decide; without damping only damping does" in repr(found)
 
 
+def test_a_point_without_result_has_no_sensitivities():
+    lost = dt.point(
+        "cardan", "floquet", beta=0.3, Omega=1e-300, zeta=0.1, alpha=1.0, mu=1.0, gamma=1e9, sensitivities=True
+    )
+    assert lost.outcome.name == "STEP_LIMIT" and lost.sensitivities == []
+    assert "undecided" in repr(lost) and "spectral radius is 1" not in repr(lost)
+
+
 def test_a_point_gives_sensitivities_by_its_physical_data_when_asked(capsys):
     point = DATA | {"speed": 3130.0}
     words = [f"{name}={value}" for name, value in point.items()]
