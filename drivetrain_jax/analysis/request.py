@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -27,6 +27,8 @@ def make_request(
 
     Raises :class:`InputError` with one line that names what the system offers.
     """
+    if outputs is not None and not isinstance(outputs, Iterable):
+        raise InputError(f"outputs = {shown(outputs)}: allowed is a list of names")
     lacking = analysis.lacks(system)
     names = [v.name for v in analysis.variables]
     offered = [name for name in names if name not in lacking]

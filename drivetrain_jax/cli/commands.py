@@ -164,6 +164,8 @@ def plot(options: argparse.Namespace) -> int:
     if ending in _TABLES:
         from drivetrain_jax.datasets.figure import table
 
+        if len(options.files) > 1 or options.part or options.cells is not None:
+            raise InputError(f"out = {str(options.out)!r}: a table shows one whole result; allowed are figures")
         with _reading(options.files[0]):
             text = table(options.files[0], options.units, _TABLES[ending])
         _write(options.out, text.encode())
@@ -215,7 +217,8 @@ def _reading(*files: Path) -> ExitStack:
     if sys.stderr.isatty():
         from drivetrain_jax.cli.progress import working_on
 
-        stack.enter_context(working_on(", ".join(file.name for file in files)))
+        first, *more = [file.name for file in files]
+        stack.enter_context(working_on(f"{first} and {len(more)} more" if more else first))
     for file in files:
         stack.enter_context(gate.reading(file))
     return stack
@@ -249,6 +252,9 @@ def point(options: argparse.Namespace) -> int:
     for name in ("system", "analysis"):
         if name in given:
             raise InputError(f"{name} = {given[name]!r}: given twice; allowed is once, in front of the values")
+    for name in ("amplitude", "sensitivities"):
+        if name in given:
+            raise InputError(f"{name} = {given[name]!r}: not a parameter; did you mean the option --{name}?")
     outputs = given.pop("outputs", None)
     if isinstance(outputs, str):
         outputs = outputs.split(",")

@@ -54,8 +54,13 @@ def progress_line() -> Iterator[Callable[[Progress], None]]:
 @contextmanager
 def working_on(text: str) -> Iterator[None]:
     """Show a moving sign, ``text`` and the time on standard error, and remove them at the end."""
-    columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
+    columns = SpinnerColumn("line"), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
     console = Console(stderr=True)
+    if not console.is_interactive:
+        yield
+        return
+    # Ctrl-C ends the process at once, and nothing would show a hidden cursor again.
+    console.show_cursor = lambda show=True: False
     # Answers must go to standard output even while the sign is shown.
     with Bar(*columns, console=console, transient=True, redirect_stdout=False, redirect_stderr=False) as bar:
         bar.add_task(text, total=None)

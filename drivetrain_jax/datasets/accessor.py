@@ -42,6 +42,8 @@ class DrivetrainAccessor:
         from drivetrain_jax.invariants.verify import verify_dataset
 
         self._analysis()
+        if "outcome" in self._dataset and self._dataset["outcome"].dtype.kind not in "iu":
+            raise InputError("outcome: words; allowed are its codes, as before .named()")
         return verify_dataset(self._dataset, self._file())
 
     def query(self, **values: Any) -> Reply:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,7 +65,13 @@ def plot(
     if part is not None or cells is not None:
         field = f"part = {shown(part)}" if part is not None else f"cells = {cells}"
         raise InputError(f"{field}: a result on a grid is drawn whole; allowed for an atlas")
-    return _drawn([_loaded(dataset) for dataset in datasets], asked)
+    try:
+        return _drawn([_loaded(dataset) for dataset in datasets], asked)
+    except (KeyError, IndexError) as error:
+        if any(isinstance(source, (str, Path)) for source in sources):
+            raise
+        lost = (re.search(r"'[^']+'", str(error)) or ["a dimension"])[0]
+        raise InputError(f"result: without {lost}, which its figure needs; allowed is a whole result") from error
 
 
 def table(path: Path, units: str | None, separator: str = "") -> str:
@@ -119,14 +126,20 @@ def _opened(path: Path) -> xr.Dataset:
 def _chart(
     source: Result,
     dataset: xr.Dataset,
-    part: Mapping[str, float | tuple[float, float]] | None,
+    part: Mapping[str, Any] | None,
     cells: int | None,
 ) -> xr.Dataset:
     from drivetrain_jax.runs.atlas_chart import chart
 
+    if part is not None and not isinstance(part, Mapping):
+        raise InputError(f"part = {shown(part)}: allowed are numbers or (low, high) by the name of a parameter")
+    for name, value in (part or {}).items():
+        if isinstance(value, (list, tuple)) and len(value) != 2:
+            raise InputError(f"part.{name} = {shown(value)}: allowed is a number or (low, high)")
+    shown_part = {name: tuple(value) if isinstance(value, list) else value for name, value in (part or {}).items()}
     # An atlas is checked for damage if it is opened from its file.
     place = Path(source) if isinstance(source, (str, Path)) else dataset
-    return chart(place, part or {}, CELLS if cells is None else cells)
+    return chart(place, shown_part, CELLS if cells is None else cells)
 
 
 def _with_resonances(dataset: xr.Dataset) -> xr.Dataset:

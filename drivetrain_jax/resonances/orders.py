@@ -11,8 +11,8 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 
-# Natural frequencies below this part of the largest one belong to rigid motions, which no order meets.
-_RIGID = 1e-6
+# Natural frequencies below this part of the largest one, or below these Hz, belong to rigid motions, which no order meets.
+_RIGID, _SLOWEST = 1e-6, 1e-6
 # Results that are natural frequencies, and Hz for one of their units.
 FREQUENCIES = ("natural_frequency", "critical_speed", "angular_frequency")
 _IN_HERTZ = {"Hz": 1.0, "rpm": 1 / 60, "rad/s": 1 / (2 * np.pi)}
@@ -37,9 +37,8 @@ class Orders:
         [nan, 600.0]
         """
         frequency = np.asarray(frequency, float)
-        elastic = np.isfinite(frequency) & (
-            frequency > _RIGID * np.max(frequency, initial=0.0, where=frequency < np.inf)
-        )
+        largest = np.max(frequency, initial=0.0, where=frequency < np.inf)
+        elastic = np.isfinite(frequency) & (frequency > max(_RIGID * largest, _SLOWEST))
         return np.where(elastic, frequency, np.nan)[..., None] * 60 / np.array(list(self.per_turn.values()))
 
     def within(self, speeds: np.ndarray, low: float, high: float, unit: str = "rpm") -> list[str]:

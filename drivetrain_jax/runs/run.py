@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -77,14 +78,20 @@ def run(
     2
     """
     executor = make_executor(threads, workers, dask)
-    if out is None and reuse:
-        raise InputError("reuse: given without out; allowed is a run into a file")
-    with shown_progress(report) as shown:
+    _check_output(out, reuse)
+    with shown_progress(report) as show:
         if out is None:
-            return _in_memory(_job(scene, overrides, on_disk=False), executor, shown)
-        more: dict[str, Any] = {"executor": executor, "reuse": reuse, "report": shown}
+            return _in_memory(_job(scene, overrides, on_disk=False), executor, show)
+        more: dict[str, Any] = {"executor": executor, "reuse": reuse, "report": show}
         run_to_file(scene, Path(out), overrides=overrides, fresh=fresh, store="hdf5", **more)
     return open_result(Path(out))
+
+
+def _check_output(out: object, reuse: object) -> None:
+    if out is not None and (not isinstance(out, (str, PathLike)) or "\0" in str(out)):
+        raise InputError(f"out = {shown(out)}: allowed is the path of a file")
+    if out is None and reuse:
+        raise InputError("reuse: given without out; allowed is a run into a file")
 
 
 def run_to_file(

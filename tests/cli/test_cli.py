@@ -124,6 +124,15 @@ def test_a_terminal_shows_what_is_worked_on(capsys, monkeypatch):
         print("the answer")
     found = capsys.readouterr()
     assert found.out == "the answer\n" and "atlas.nc" in found.err
+    assert "\x1b[?25l" not in found.err, "a hidden cursor would stay so after Ctrl-C"
+    with _reading(Path("atlas.nc"), Path("b.nc"), Path("c.nc")):
+        pass
+    assert "atlas.nc and 2 more" in capsys.readouterr().err
+    monkeypatch.setenv("TERM", "dumb")
+    with _reading(Path("atlas.nc")):
+        pass
+    assert capsys.readouterr().err == ""
+    monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(sys.stderr, "isatty", lambda: False)
     with _reading(Path("atlas.nc")):
         assert capsys.readouterr().err == ""
@@ -307,6 +316,16 @@ def test_wrong_run_is_one_line_and_writes_nothing(cli, folder, case):
         (("point", "toy", "toy", "a=1", "outputs=true"), "outputs = True: allowed is list"),
         (("point", "toy", "toy", "a=1", "system=toy"), "system = 'toy': given twice"),
         (("point", "toy", "toy", "a=1", "analysis=toy"), "analysis = 'toy': given twice"),
+        (
+            ("point", "toy", "toy", "a=1", "amplitude=2"),
+            "amplitude = 2: not a parameter; did you mean the option --ampl",
+        ),
+        (("point", "toy", "toy", "a=1", "sensitivities=true"), "did you mean the option --sensitivities?"),
+        (
+            ("plot", "r.nc", "s.nc", "--out", "t.csv"),
+            "out = 't.csv': a table shows one whole result; allowed are figures",
+        ),
+        (("plot", "r.nc", "--part", "a=1", "--out", "t.txt"), "out = 't.txt': a table shows one whole result"),
         (("point", "toy", "toy", "a=" + "9" * 5000), "a = inf: allowed is 0 <= a <= 10"),
         (("point", "toy", "toy", "a=" + "[" * 20_000), "nested too deeply"),
         (("plot", "nothing.nc", "--out", "f.png"), "does not exist"),

@@ -147,6 +147,8 @@ def test_what_plot_takes(folder, chart):
             "units = ['rpm', 5]: allowed are units such as \"rpm,deg\", or a list of them",
         ),
         (["atlas.nc"], {"cells": "many"}, "cells = 'many': allowed is a whole number, 2 <= cells <= 20000"),
+        (["atlas.nc"], {"part": 5}, "part = 5: allowed are numbers or (low, high) by the name of a parameter"),
+        (["atlas.nc"], {"part": {"beta": [0, 1, 2]}}, "part.beta = [0, 1, 2]: allowed is a number or (low, high)"),
         ([5], {}, "result: got a int; allowed is a Dataset, the path of a result, or a list of them"),
     ],
 )
@@ -159,6 +161,16 @@ def test_what_plot_does_not_take(folder, results, options, message):
 def test_a_grid_without_end_is_not_drawn(folder):
     with pytest.raises(dt.InputError, match=r"has 1e\+10 cells; allowed in a figure are up to 1e\+08: select some"):
         xr.open_dataset(folder / "atlas.nc", engine="drivetrain", grid=100_000).drivetrain.plot()
+
+
+def test_what_a_part_lacks_is_named(chart):
+    with pytest.raises(dt.InputError, match="result: without 'outcome', which its figure needs; allowed is a whole"):
+        dt.plot(chart.load().drop_vars("outcome"))
+
+
+def test_words_are_not_verified(chart):
+    with pytest.raises(dt.InputError, match=r"outcome: words; allowed are its codes, as before \.named\(\)"):
+        chart.drivetrain.named().drivetrain.verify()
 
 
 def test_words_are_not_drawn(chart):

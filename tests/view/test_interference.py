@@ -49,6 +49,14 @@ def test_without_teeth_no_order_is_known():
     assert orders_of("cardan", {}) is None
 
 
+def test_a_rigid_motion_alone_has_no_meeting():
+    """Selected alone, it is its own largest frequency; computed, it is not exactly 0."""
+    found = dt.run({"system": "planetary", "analysis": "modes", "fixed": {"teeth": [20, 26, 72]}})
+    rigid = found.isel(mode=[0])
+    assert np.isnan(rigid.assign(natural_frequency=0 * rigid.natural_frequency + 1e-7).drivetrain.orders()).all()
+    assert np.isnan(rigid.drivetrain.orders()).all() and np.isfinite(found.drivetrain.orders()[1:]).all()
+
+
 def test_joints_meet_a_critical_speed_at_half_of_it(capsys):
     words = [f"{name}={json.dumps(value)}" for name, value in (SHAFT | RANGE).items()]
     assert main(["point", "bicardan", "critical_speeds", "modes=3", *words]) == 0
