@@ -69,9 +69,9 @@ class Parameter:
         listed = "[i]" if self.listed else ""
         either = " (or one number for all)" if self.listed and self.broadcast else ""
         either += ", or 0" if self.or_zero else ""
-        if left or right:
-            return f"{kind}{left}{self.name}{listed}{right}{either}"
-        return f"{self.name} is a finite {kind or 'number'}".rstrip()
+        if not left and not right:
+            left, right = "-inf < ", " < inf"
+        return f"{kind}{left}{self.name}{listed}{right}{either}"
 
     @property
     def allowed_in_units(self) -> str:
