@@ -140,10 +140,12 @@ def in_parameters(
     values = {n: _numbers(allowed[n], v, n in names) if n in allowed else v for n, v in given.items()}
     if physical is None or not (written or known or any(name in names for name in given)):
         return None, values
-    replaced = {each.needs[0] for each in physical.conversions if each.parameter in values}
-    data = {name: value for name, value in known.items() if name not in replaced} | values
-    pool = {n: Along(n, np.array(v)) if isinstance(v, tuple) else v for n, v in data.items()}
-    found = {n: v for n, v in physical.converted(pool).items() if n not in names}
+    replaced = {each.parameter: each.needs[0] for each in physical.conversions if each.parameter in values}
+    # The atlas compares a value that repeats what follows from its own data.
+    repeated = {parameter for parameter, name in replaced.items() if name in known.keys() - values}
+    data = {**known, **values}
+    pool = {n: Along(n, np.array(v)) if isinstance(v, tuple) else v for n, v in data.items() if n not in repeated}
+    found = {n: v for n, v in physical.converted(pool).items() if n not in names and n not in repeated}
     converted = {n: tuple(v.values.tolist()) if isinstance(v, Along) else v for n, v in found.items()}
     return GivenData(physical, data), {n: v for n, v in values.items() if n not in names} | converted
 

@@ -312,6 +312,26 @@ def test_a_slowly_resolved_boundary_function_is_not_taken_for_rounding():
     assert not found["undecided"]
 
 
+def test_a_question_may_repeat_what_follows_from_the_data_of_the_atlas():
+    """``zeta`` follows from c1, as ``alpha`` does: to replace c1 by it left nothing for ``alpha``."""
+    given = {"J1": 2.0, "J2": 0.5, "k1": 6e4, "k2": 4e4, "c1": 0.3464, "c2": 0.1414, "angle": "12 deg"}
+    speed = {"start": "1400 rpm", "stop": "1450 rpm"}
+    atlas = dt.open_atlas(dt.run({"system": "cardan", "analysis": "atlas", "axes": {"speed": speed}, "fixed": given}))
+    plain = atlas_answers.query(atlas, {"speed": 1425.0}).data
+    for repeated in ({"zeta": 0.0005}, {"zeta": 0.0005, "alpha": 0.4082, "mu": 2 / 3, "gamma": 0.25, "beta": "12 deg"}):
+        assert atlas_answers.query(atlas, {"speed": 1425.0, **repeated}).data == plain
+    for other, message in (
+        ({"zeta": 0.001}, r"^zeta = 0\.001: the atlas is made for zeta = 0\.00049998"),
+        ({"mu": 0.5}, r"^mu = 0\.5: the atlas is made for mu = 0\.6666"),
+        (
+            {"zeta": 0.0005, "c1": 1.0, "c2": 0.4082},
+            r"^zeta = 0\.0005: given besides c1, J1, k1; allowed is one of the two",
+        ),
+    ):
+        with pytest.raises(dt.InputError, match=message):
+            atlas_answers.query(atlas, {"speed": 1425.0, **other})
+
+
 def test_nothing_found_beside_undecided_ranges_is_not_nothing(monkeypatch):
     atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
     for undecided, text in (
