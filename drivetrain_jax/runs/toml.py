@@ -93,7 +93,12 @@ def plain(value: Any) -> Any:
         return {key: plain(entry) for key, entry in value.items()}
     value = with_unit(value)
     if hasattr(value, "tolist"):
-        return value.tolist()
+        try:
+            return value.tolist()
+        except TypeError:
+            raise InputError(
+                "scene: does not work under jax.jit, jax.grad or jax.vmap; allowed is a function such as dt.floquet"
+            ) from None
     if isinstance(value, (Decimal, Fraction)):
         return float(value)
     if isinstance(value, os.PathLike):

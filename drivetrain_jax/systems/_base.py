@@ -204,7 +204,7 @@ class System(eqx.Module):
 
     @classmethod
     def from_physical(cls, **data: Any) -> Any:
-        """The system whose parameters follow from physical ``data``; parameters may be among them.
+        """The system whose parameters follow from physical ``data``; parameters may be among them, and JAX may trace them.
 
         >>> from drivetrain_jax import Cardan
         >>> print(round(Cardan.from_physical(J1=2, J2=0.5, k1=6e4, k2=4e4, c1=0.3, c2=0.2, speed=1425, angle=12).Omega, 4))

@@ -1,4 +1,4 @@
-"""Physical data of a system, and the parameters that follow from them. The arithmetic is NumPy's."""
+"""Physical data of a system, and the parameters that follow from them: in NumPy, unless data are traced by JAX."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import jax.core
 import numpy as np
 
 from drivetrain_jax._errors import InputError
@@ -142,4 +143,4 @@ def _evaluated(conversion: Conversion, needs: list[Any]) -> Any:
     value = conversion.value(*(each.values if isinstance(each, Along) else each for each in needs))
     if axes:
         return Along(axes[0], np.asarray(value, float))
-    return value if isinstance(value, str) or np.ndim(value) else float(value)
+    return value if isinstance(value, (str, jax.core.Tracer)) or np.ndim(value) else float(value)

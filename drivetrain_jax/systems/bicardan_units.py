@@ -9,6 +9,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter
+from drivetrain_jax.systems._base import numeric
 from drivetrain_jax.systems._physical import POSITIVE, Conversion, PhysicalData
 
 # Young's modulus [Pa], shear modulus [Pa], density [kg/m^3] of structural steel, aluminium alloys and Ti-6Al-4V.
@@ -20,9 +21,11 @@ MATERIALS = {
 
 
 def _ring(outer: Any, inner: Any, power: int) -> Any:
-    if np.any(np.asarray(inner) >= np.asarray(outer)):
+    xp, outside, inside = numeric(outer, inner)
+    # A traced value cannot be checked.
+    if xp is np and np.any(inside >= outside):
         raise InputError(f"inner_diameter = {inner!r}: allowed is less than outer_diameter = {outer!r}")
-    return np.asarray(outer) ** power - np.asarray(inner) ** power
+    return outside**power - inside**power
 
 
 def _area(outer: Any, inner: Any) -> Any:
@@ -35,7 +38,8 @@ def _second_moment(outer: Any, inner: Any) -> Any:
 
 def shear_coefficient(outer: Any, inner: Any, e: Any, g: Any) -> Any:
     """Cowper's coefficient of a hollow circle, J. Appl. Mech. 33 (1966), 335-340."""
-    nu, m2 = e / (2 * g) - 1, (np.asarray(inner) / outer) ** 2
+    _, outer, inner, e, g = numeric(outer, inner, e, g)
+    nu, m2 = e / (2 * g) - 1, (inner / outer) ** 2
     round_part = (1 + m2) ** 2
     return 6 * (1 + nu) * round_part / ((7 + 6 * nu) * round_part + (20 + 12 * nu) * m2)
 

@@ -8,19 +8,32 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter
+from drivetrain_jax.systems._base import numeric
 from drivetrain_jax.systems._physical import POSITIVE, RPM, Conversion, PhysicalData
 
 
 def _alpha(c2: Any, c1: Any) -> Any:
-    # Without damping of the driving shaft the ratio has no meaning.
-    if np.any((np.asarray(c1) == 0) & (np.asarray(c2) != 0)):
-        raise InputError(f"c2 = {c2!r}: allowed is 0 if c1 = 0 (alpha = c2/c1)")
-    return np.divide(c2, np.where(np.asarray(c1) == 0, 1.0, c1))
+    xp, c2, c1 = numeric(c2, c1)
+    # Without damping of the driving shaft the ratio has no meaning. A traced value cannot be checked.
+    if xp is np and np.any((c1 == 0) & (c2 != 0)):
+        raise InputError(f"c2 = {c2.tolist()!r}: allowed is 0 if c1 = 0 (alpha = c2/c1)")
+    return xp.divide(c2, xp.where(c1 == 0, 1.0, c1))
+
+
+def _radians(angle: Any) -> Any:
+    xp, angle = numeric(angle)
+    return xp.radians(angle)
+
+
+def _frequency(j1: Any, k1: Any) -> Any:
+    xp, j1, k1 = numeric(j1, k1)
+    return xp.sqrt(k1 / j1)
 
 
 def _unit_of_damping(j1: Any, k1: Any) -> Any:
+    xp, j1, k1 = numeric(j1, k1)
     # Square roots one by one, because in some units the product overflows.
-    return 2 * np.sqrt(k1) * np.sqrt(j1)
+    return 2 * xp.sqrt(k1) * xp.sqrt(j1)
 
 
 PHYSICAL = PhysicalData(
@@ -35,13 +48,13 @@ PHYSICAL = PhysicalData(
         Parameter("angle", "deg", "joint angle", lower=-90.0, upper=90.0, open_lower=True, open_upper=True),
     ),
     (
-        Conversion("beta", ("angle",), np.radians, "angle", np.degrees),
+        Conversion("beta", ("angle",), _radians, "angle", np.degrees),
         Conversion(
             "Omega",
             ("speed", "J1", "k1"),
-            lambda speed, j1, k1: speed * RPM / np.sqrt(k1 / j1),
+            lambda speed, j1, k1: speed * RPM / _frequency(j1, k1),
             "speed sqrt(J1/k1)",
-            lambda omega, j1, k1: omega * np.sqrt(k1 / j1) / RPM,
+            lambda omega, j1, k1: omega * _frequency(j1, k1) / RPM,
         ),
         Conversion(
             "zeta",

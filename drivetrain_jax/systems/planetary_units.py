@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter
+from drivetrain_jax.systems._base import numeric
 from drivetrain_jax.systems._physical import POSITIVE, Conversion, PhysicalData
 
 
@@ -19,7 +18,8 @@ def _teeth(teeth: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _phase(angle: Any) -> Any:
-    return angle - 2 * math.pi * np.round(angle / (2 * math.pi))
+    xp, angle = numeric(angle)
+    return angle - 2 * math.pi * xp.round(angle / (2 * math.pi))
 
 
 PHYSICAL = PhysicalData(

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
 from drivetrain_jax._quantities import Parameter
+from drivetrain_jax.systems._base import numeric
 from drivetrain_jax.systems._physical import POSITIVE, RPM, Conversion, PhysicalData
+
+
+def _unit_of_damping(k: Any, i: Any) -> Any:
+    xp, k, i = numeric(k, i)
+    return 2 * xp.sqrt(k * i)
+
 
 PHYSICAL = PhysicalData(
     (
@@ -42,9 +49,9 @@ PHYSICAL = PhysicalData(
         Conversion(
             "c",
             ("damping_ratio", "k", "I"),
-            lambda ratio, k, i: 2 * ratio * np.sqrt(k * i),
+            lambda ratio, k, i: ratio * _unit_of_damping(k, i),
             "2 damping_ratio sqrt(k I)",
-            lambda c, k, i: c / (2 * np.sqrt(k * i)),
+            lambda c, k, i: c / _unit_of_damping(k, i),
         ),
     ),
 )

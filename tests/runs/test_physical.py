@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 
+import jax
 import numpy as np
 import pytest
 import xarray as xr
@@ -24,6 +25,17 @@ SHAFT = {
 }
 
 
+TRACED = {
+    dt.Cardan: {"J1": 2.0, "J2": 0.5, "k1": 6e4, "k2": 4e4, "c1": 0.3464, "c2": 0.1414, "angle": 12.0, "speed": 1425.0},
+    dt.Rattle: GEARS | {"r_x": 0.05, "r_y": 0.1, "backlash": 1e-4, "speed": 900.0},
+    dt.Bicardan: {
+        "outer_diameter": [0.06, 0.09], "inner_diameter": [0.0, 0.082], "E": 2.1e11, "G": 8e10, "density": 7850.0,
+        "length": [0.3, 1.2], "k_A": 5e6, "k_D": 5e6,
+    },
+    dt.Planetary: {"teeth": [20, 26, 72], "planet_angle": [0.0, 1.3, 2.4, 4.1]},
+}  # fmt: skip
+
+
 def cardan(analysis="floquet", **tables):
     return {"system": "cardan", "analysis": analysis, **tables}
 
@@ -33,6 +45,39 @@ def refused(scene):
         load_scene(scene)
     assert "\n" not in str(error.value)
     return str(error.value)
+
+
+@pytest.mark.parametrize("system", TRACED)
+def test_traced_data_give_the_same_parameters_and_their_slopes(system):
+    data = {n: jax.tree.map(float, v) for n, v in TRACED[system].items() if n != "teeth"}
+    words = {"teeth": TRACED[system]["teeth"]} if system is dt.Planetary else {}
+
+    def parameters(data):
+        return np.concatenate([np.ravel(x) for x in jax.tree.leaves(system.from_physical(**words, **data))])
+
+    def traced(data):
+        return jax.tree.leaves(system.from_physical(**words, **data))
+
+    expected = parameters(data)
+    np.testing.assert_allclose(np.concatenate([np.ravel(x) for x in jax.jit(traced)(data)]), expected, rtol=1e-14)
+    leaves, tree = jax.tree.flatten(data)
+    directions = np.random.default_rng(0).normal(size=len(leaves))
+    step = [1e-6 * x * d for x, d in zip(leaves, directions, strict=True)]
+    up, down = (tree.unflatten([x + sign * h for x, h in zip(leaves, step, strict=True)]) for sign in (1, -1))
+    slope = jax.jvp(traced, (data,), (tree.unflatten(step),))[1]
+    change = (parameters(up) - parameters(down)) / 2
+    np.testing.assert_allclose(np.concatenate([np.ravel(x) for x in slope]), change, rtol=1e-6, atol=1e-12)
+
+
+def test_a_scene_is_not_traced():
+    for call in (
+        lambda x: dt.point("cardan", "floquet", **TRUCK, angle=x, speed=1425.0),
+        lambda x: dt.run(cardan(fixed=TRUCK | {"angle": x, "speed": 1425.0})),
+    ):
+        with pytest.raises(
+            dt.InputError, match=r"^scene: does not work under jax\.jit, jax\.grad or jax\.vmap; allowed is"
+        ):
+            jax.jit(call)(12.0)
 
 
 def test_a_chart_in_rpm_and_degrees(tmp_path):
