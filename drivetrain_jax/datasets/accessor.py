@@ -39,12 +39,16 @@ class DrivetrainAccessor:
 
         Returns: a report to be printed; ``problem`` is the first problem, empty without one.
         """
+        from drivetrain_jax.datasets.figure import lacks
         from drivetrain_jax.invariants.verify import verify_dataset
 
         self._analysis()
         if "outcome" in self._dataset and self._dataset["outcome"].dtype.kind not in "iu":
-            raise InputError("outcome: words; allowed are its codes, as before .named()")
-        return verify_dataset(self._dataset, self._file())
+            raise InputError("outcome: no codes; allowed is the result itself, as before .named() or a mean")
+        try:
+            return verify_dataset(self._dataset, self._file())
+        except (KeyError, ValueError) as error:
+            raise lacks(error, "a rule needs") from error
 
     def query(self, **values: Any) -> Reply:
         """The answer of an atlas at one point: results, gradient, and the nearest changes of stability.

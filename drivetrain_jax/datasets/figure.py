@@ -70,8 +70,13 @@ def plot(
     except (KeyError, IndexError) as error:
         if any(isinstance(source, (str, Path)) for source in sources):
             raise
-        lost = (re.search(r"'[^']+'", str(error)) or ["a dimension"])[0]
-        raise InputError(f"result: without {lost}, which its figure needs; allowed is a whole result") from error
+        raise lacks(error, "its figure needs") from error
+
+
+def lacks(error: Exception, why: str) -> InputError:
+    """The error of a part of a result that has no more what ``error`` names."""
+    lost = (re.search(r"'[^']+'", str(error)) or ["a dimension"])[0]
+    return InputError(f"result: without {lost}, which {why}; allowed is a whole result")
 
 
 def table(path: Path, units: str | None, separator: str = "") -> str:

@@ -166,10 +166,16 @@ def test_a_grid_without_end_is_not_drawn(folder):
 def test_what_a_part_lacks_is_named(chart):
     with pytest.raises(dt.InputError, match="result: without 'outcome', which its figure needs; allowed is a whole"):
         dt.plot(chart.load().drop_vars("outcome"))
+    modes = dt.run({"system": "planetary", "analysis": "modes"})
+    with pytest.raises(dt.InputError, match="result: without 'mode', which a rule needs; allowed is a whole result"):
+        modes.isel(mode=0).drivetrain.verify()
+    assert not modes.isel(mode=[0, 1]).drivetrain.verify().problem
 
 
 def test_words_are_not_verified(chart):
-    with pytest.raises(dt.InputError, match=r"outcome: words; allowed are its codes, as before \.named\(\)"):
+    with pytest.raises(
+        dt.InputError, match=r"outcome: no codes; allowed is the result itself, as before \.named\(\) or"
+    ):
         chart.drivetrain.named().drivetrain.verify()
 
 
