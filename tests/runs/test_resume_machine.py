@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,12 @@ from drivetrain_jax.store import shards, zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
 
 COUNTS, NUMBERS = (8, 24, 40), (3, 4)
+
+
+def copied_if_there(source, target):
+    """Another thread may rename a temporary file between the list of a folder and the copy of the file."""
+    with suppress(FileNotFoundError):
+        shutil.copy2(source, target)
 
 
 class ResumeMachine(RuleBasedStateMachine):
@@ -104,7 +111,7 @@ class ResumeMachine(RuleBasedStateMachine):
         def report(_):
             if next(left, None) is None:
                 if kill and not copy.exists():
-                    shutil.copytree(self.path.parent, copy)
+                    shutil.copytree(self.path.parent, copy, copy_function=copied_if_there)
                 raise KeyboardInterrupt
 
         try:
