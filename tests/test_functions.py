@@ -294,7 +294,7 @@ def test_any_function_is_swept_resumed_and_refused(tmp_path):
     assert dt.sweep(one(2.0), pytree, over=over, out=out, fresh=True).root[1, 1] == 12.0
 
 
-def test_a_result_without_end_is_no_result_and_codes_are_known():
+def test_an_infinite_result_is_missing_and_codes_are_known():
     found = swept(lambda p: {"r": 1 / p["a"], "n": jnp.int32(3)})
     assert np.isnan(found.r[0]) and found.r[1] == 2.0 and found.n.values.tolist() == [3, 3]
     assert found.outcome.values.tolist() == [Outcome.NOT_FINITE, Outcome.SUCCESS]

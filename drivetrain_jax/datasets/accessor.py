@@ -47,6 +47,8 @@ class DrivetrainAccessor:
             raise InputError("outcome: no codes; allowed is the result itself, as before .named() or a mean")
         try:
             return verify_dataset(self._dataset, self._file())
+        except InputError:
+            raise
         except (KeyError, ValueError) as error:
             raise lacks(error, "a rule needs") from error
 

@@ -74,7 +74,7 @@ def plot(
 
 
 def lacks(error: Exception, why: str) -> InputError:
-    """The error of a part of a result that has no more what ``error`` names."""
+    """The error for a part of a result that lacks what ``error`` names."""
     lost = (re.search(r"'[^']+'", str(error)) or ["a dimension"])[0]
     return InputError(f"result: without {lost}, which {why}; allowed is a whole result")
 

@@ -104,8 +104,8 @@ def _scene_table(
         )
     # An empty list stands for a default of none.
     conversions = system.physical.conversions if system.physical else ()
-    given = {*over, *(each.parameter for each in conversions if each.needs[0] in over)}
-    kept = {key: value for key, value in system.values.items() if key not in given and not _is_empty(value)}
+    varied = {*over, *(each.parameter for each in conversions if each.needs[0] in over)}
+    kept = {key: value for key, value in system.values.items() if key not in varied and not _is_empty(value)}
     fixed = {key: _plain(key, value, system.parameter(key).listed) for key, value in kept.items()}
     axes = {key: value if isinstance(value, Mapping) else {"values": _row(key, value)} for key, value in over.items()}
     table = {"system": system.name, "analysis": name, "axes": axes, "fixed": fixed, "options": dict(options)}
@@ -249,7 +249,7 @@ def _kind(
 
 
 def _with_outcome(results: Mapping[str, Array], code: Array | None) -> dict[str, Array]:
-    """``results`` and their outcome: the code of the function, or success if all are finite; otherwise all are NaN."""
+    """``results`` and their outcome, the ``code`` of the function. Without one, all are NaN if one number is not finite."""
     if code is not None:
         known = (code >= 0) & (code <= max(Outcome))
         return {**results, OUTCOME.name: jnp.where(known, code, Outcome.NOT_FINITE).astype(jnp.int8)}

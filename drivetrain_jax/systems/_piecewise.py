@@ -51,6 +51,7 @@ class PiecewiseLinearOscillator(eqx.Module):
     @property
     def oscillates(self) -> Any:
         """True where free motion is underdamped in contact and within the play."""
+        # A square that overflows is infinite, and so compares as it should.
         with np.errstate(over="ignore"):
             return (self.damping / 2) ** 2 < self.stiffness * jnp.minimum(1.0, self.alpha)
 

@@ -172,6 +172,17 @@ def test_what_a_part_lacks_is_named(chart):
     assert not modes.isel(mode=[0, 1]).drivetrain.verify().problem
 
 
+def test_wrong_input_of_a_rule_keeps_its_line(chart, monkeypatch):
+    """``InputError`` is a ``ValueError``, and says more than that something is missing."""
+
+    def refuse(*_):
+        raise dt.InputError("rule 'own': fails")
+
+    monkeypatch.setattr("drivetrain_jax.invariants.verify.verify_dataset", refuse)
+    with pytest.raises(dt.InputError, match=r"^rule 'own': fails$"):
+        chart.drivetrain.verify()
+
+
 def test_words_are_not_verified(chart):
     with pytest.raises(
         dt.InputError, match=r"outcome: no codes; allowed is the result itself, as before \.named\(\) or"
