@@ -152,6 +152,7 @@ def test_every_analysis_of_every_system_has_a_scene():
 SAME = (
     "cardan floquet atlas",
     "cardan atlas direct",
+    "cardan floquet diffrax Kvaerno5",
     "rattle basins exact",
     "tripod floquet",
     "tripod lyapunov",

@@ -155,6 +155,7 @@ def test_results_name_their_commit_and_the_load_by_others():
     assert re.fullmatch(r"\d+\.\d\d cores by other programs|unknown", facts["load"])
 
 
+@pytest.mark.full
 def test_rivals_of_the_forced_motion_and_of_attractors_find_it():
     """The references of the new studies, against each other."""
     region = precision_forced.REGIONS["orbit"]

@@ -339,6 +339,7 @@ def test_a_chart_of_gradients():
 FIRST = "import jax, drivetrain_jax as dt", "import drivetrain_jax as dt, jax"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("first", but_full(FIRST, FIRST[0]))
 def test_the_first_use_may_be_inside_a_traced_function(first):
     code = f"""

@@ -29,6 +29,7 @@ def branch(method):
     return np.isfinite(found["branch_u_max"]).sum(axis=1), np.asarray(found["outcome"])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("method", "module"),
     [pytest.param("exact", exact_branch, marks=pytest.mark.full), ("harmonic_balance", harmonic_response)],
@@ -40,6 +41,7 @@ def test_more_motions_than_there_is_room_for(method, module, monkeypatch):
     np.testing.assert_array_equal(outcome, [Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("method", "module", "name"),
     [

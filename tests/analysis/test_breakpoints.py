@@ -83,7 +83,7 @@ def cases(count):
 
 
 @pytest.mark.parametrize(
-    "options", full_after(2, [{"method": "direct"}, {"method": "diffrax"}, {"method": "diffrax", "form": "published"}])
+    "options", full_after(1, [{"method": "direct"}, {"method": "diffrax"}, {"method": "diffrax", "form": "published"}])
 )
 def test_meissners_equation_has_its_closed_form(options):
     values = cases(24)
@@ -120,6 +120,7 @@ def test_derivatives_include_the_motion_of_the_jump(values):
         assert getattr(found, name) == pytest.approx(expected, rel=1e-9), name
 
 
+@pytest.mark.full
 def test_several_breakpoints():
     """Four jumps of a decaying first-order equation, whose multiplier is the exponential of its mean."""
     rates, ends = np.array([3.0, -1.0, 0.5, 2.0, -4.0]), (0.1, 0.15, 0.9, 1.3)
@@ -168,6 +169,7 @@ def test_rows_that_are_no_square_matrix_are_refused(rows, message):
         LinearPeriodic(lambda t: rows, 3.0).matrix(0.0)
 
 
+@pytest.mark.full
 def test_a_lane_with_a_breakpoint_outside_of_the_period_has_no_value():
     systems = jax.vmap(lambda duty: replace(Meissner(delta=1.0, jump=0.6, zeta=0.01, duty=0.3), duty=duty))
     found = jax.vmap(lambda s: dt.floquet(s, outputs=OUTPUTS).variables)(systems(jnp.array([0.3, 1.2, -0.1])))

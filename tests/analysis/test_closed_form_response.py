@@ -127,6 +127,7 @@ def test_folds_and_peak_are_at_frequencies_of_a_drive():
     assert found["peak_amplitude"][0, 0] == pytest.approx(np.nanmax(found["branch_u_max"][..., 0]), rel=1e-4)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("alpha", full_after(2, [0.0, 0.2, 0.1, 0.15, 0.3]))
 def test_the_largest_self_consistent_range_is_taken(alpha):
     """The range agrees with a dense scan from large ranges down, also where two ranges nearly merge."""
@@ -189,6 +190,7 @@ def settled(epsilon: float, sigma: float, start: float) -> float:
     return (u.max() - u.min()) / 2
 
 
+@pytest.mark.full
 def test_cubic_system_meets_averaged_amplitudes_to_first_order():
     """Integration in time: errors halve with epsilon, and the middle amplitude separates the basins of the others."""
     sigma, errors = 0.55, []
@@ -256,6 +258,7 @@ def test_amplitudes_on_both_sides_of_a_narrow_resonance():
             assert_balanced(TABLE1 | values, omega, m, a, 1e-8)
 
 
+@pytest.mark.full
 def test_weak_drives_next_to_a_flank():
     """About a rest on the flank the spring is bilinear, so amplitudes are proportional to the drive, however weak."""
     weak = {"B0": 0.05, "b": 0.5, "alpha": 0.1, "c": 0.05}
@@ -269,6 +272,7 @@ def test_weak_drives_next_to_a_flank():
         assert_balanced(TABLE1 | cases[1], omega, bias[place, 1], amplitude[place, 1])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("method", ["multiple_scales", "describing_function"])
 @pytest.mark.parametrize("exponent", [-60, 60])
 def test_units_of_length_do_not_matter(method, exponent):
@@ -350,6 +354,7 @@ def test_peak_is_the_largest_amplitude_with_heavy_damping():
     np.testing.assert_array_equal(frequency > 0, [False] * 4 + [True] * 2)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("case", full_after(2, [{}, {"alpha": 0.0}, {"alpha": 3.0, "B0": 0.0}, {"B0": 0.3}]))
 def test_the_backbone_is_the_largest_free_motion(case):
     """The backbone agrees with a scan of amplitudes; it does not depend on the drive and continues beyond the peak."""

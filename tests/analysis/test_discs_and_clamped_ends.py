@@ -293,6 +293,7 @@ def test_frequencies_at_the_ends_of_the_range_follow_the_scaling_law():
     )
 
 
+@pytest.mark.full
 def test_a_vanishing_mass_of_the_segments_changes_nothing_until_it_is_refused():
     shaft = {"length": (0.25,) * 4, "EI": (6e4, 12e4, 12e4, 6e4), "k_A": INF, "k_D": INF}
     shaft |= {"m_joint": (0.0, 400 / 9.81, 0.0), "outputs": ["critical_speed"]}

@@ -152,6 +152,7 @@ def test_many_extreme_points_are_sound(name, largest):
         assert_sound(computed(name, largest, count, seed + 1))
 
 
+@pytest.mark.full
 def test_a_heavily_damped_orbit_has_no_exponent():
     """Its multipliers, exp(-4000), underflow: they are 0, and their logarithm has no value."""
     gears = dt.Rattle(omega=0.061, B0=0.0081, B1=-0.0026, b=0.0016, c=0.1, alpha=0.35, k=2.3, I=0.0025)

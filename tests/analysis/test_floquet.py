@@ -147,6 +147,7 @@ TOO_LONG_TO_MARCH = (
 )
 
 
+@pytest.mark.full
 def test_bound_counts_rounding_of_the_implicit_scheme(direct):
     beta, omega, exact = map(np.array, zip(*TOO_LONG_TO_MARCH, strict=True))
     shaft = {
@@ -183,6 +184,7 @@ def test_slow_modes_beside_fast_ones_keep_their_digits(direct, rtol):
     assert (error <= 2e-11 * RADII).all() and (bound <= 2e-10 * RADII).all(), (error / RADII, bound / RADII)
 
 
+@pytest.mark.full
 def test_slow_modes_lose_their_digits_in_the_reduced_form():
     """The first point by the implicit scheme, which has no truncation error with this many steps."""
     model = CARDAN.models["floquet"].build({name: values[0] for name, values in SLOW_BESIDE_FAST.items()})
@@ -344,6 +346,7 @@ def test_liouville_residual_is_small_where_the_result_is_good(sample):
     assert (np.abs(found["liouville_residual"][good]) > 0).any()
 
 
+@pytest.mark.full
 def test_liouville_residual_shows_too_few_steps():
     """If both step sizes miss the motion, the determinant shows it, and the error is at least this residual."""
     values = BASE | {"beta": 1.2, "Omega": 0.1, "zeta": 0.001}
@@ -376,6 +379,7 @@ def test_only_what_is_asked_for_is_returned(method, outputs):
             )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("solver", but_full(["Tsit5", "Kvaerno5"], "Kvaerno5"))
 def test_any_diffrax_solver_gives_the_same(direct, solver):
     batch = FloquetBatch("diffrax", outputs=("spectral_radius",), chunk=(2,), solver=solver)

@@ -171,6 +171,7 @@ LINEAR = ("periodic_state", "periodic_state_error", "amplitude")
 linear_only = quick_jit(lambda values: solver(LINEAR).solve(values, 0))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("given", LINEAR_POINTS, ids=str)
 def test_linear_response_against_scipy(given):
     disks = Disks(**given)
@@ -308,12 +309,14 @@ def test_peaks_between_steps(frequency):
     assert end[1] == pytest.approx(-math.sin(6.1 * frequency + 0.4), abs=1e-8)
 
 
+@pytest.mark.full
 def test_field_that_is_not_finite():
     for broken in (lambda t, y: y * jnp.nan, lambda t, y: y**2):
         assert integrate(broken, jnp.ones(2), 3.0, 1e-8)[1] == Outcome.NOT_FINITE
         assert amplitudes(broken, jnp.ones(2), 3.0, (0,), 1e-8)[3] == Outcome.NOT_FINITE
 
 
+@pytest.mark.full
 def test_no_orbit_without_restoring_force():
     """y'' = 1 + sin t drifts: the linear problem is singular, and no orbit exists."""
     found = shoot(lambda t, y: jnp.stack([y[1], 1 + jnp.sin(t)]), jnp.array([1.0, 0.0]), 2 * math.pi, 1e-10)

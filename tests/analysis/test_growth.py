@@ -25,6 +25,7 @@ def mean_and_error(series: np.ndarray, used: int = SEGMENTS) -> tuple[np.ndarray
     return np.asarray(mean)[0], np.asarray(error)[0]
 
 
+@pytest.mark.full
 def test_standard_error_of_independent_segments():
     """The error of 48 segments is sigma/sqrt(48) per duration of a segment; the larger of two estimates is 9 % more on
     average."""
@@ -75,6 +76,7 @@ def damped(max_time: float, lanes: int = 4):
     return lambda: record_growth(flow, 12, max_time, 0.0, jnp.ones(lanes, bool))
 
 
+@pytest.mark.full
 def test_memory_does_not_grow_with_the_number_of_strobes():
     """The record and the working memory have the same size for 64 strobes and for 64,000."""
     sizes = []

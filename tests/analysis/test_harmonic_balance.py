@@ -72,6 +72,7 @@ def test_jacobian_is_the_derivative_up_to_the_quadrature():
     assert errors[1] < errors[0] / 50
 
 
+@pytest.mark.full
 def test_error_falls_with_the_harmonics():
     case, errors = STEADY["T1 w.7 double-sided"], []
     model = model_of(({},), 0.7)
@@ -187,6 +188,7 @@ def test_one_harmonic_is_the_describing_function():
         assert np.nanmin(distance, axis=1).max() < 2e-9
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("samples", full_after(1, [63, 100]))
 def test_any_number_of_samples(samples):
     omegas = np.array([0.7, 0.9])
@@ -223,6 +225,7 @@ def test_spectral_radius_is_over_the_period_of_the_motion():
     np.testing.assert_allclose(four["spectral_radius"][1], two["spectral_radius"][1], rtol=1e-5)
 
 
+@pytest.mark.full
 def test_subharmonics_follow_a_doubled_period():
     case = STEADY["T1 P2 w.45"]
 
@@ -252,6 +255,7 @@ def test_a_lane_does_not_depend_on_the_others():
         np.testing.assert_array_equal(value[..., 0], others[name][..., 0], err_msg=name)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("harmonics", full_after(1, [1, 2]))
 def test_what_lies_between_two_folds_is_a_saddle(harmonics):
     """The motion is a saddle even if disturbances with few harmonics decay, in agreement with the describing function."""

@@ -64,6 +64,7 @@ def test_mesh_phases_choose_the_modes(order, silent):
     assert len(still) >= 3 and float(largest.sel(dof=still).max()) < 1e-12 * float(largest.max())
 
 
+@pytest.mark.full
 def test_rotational_model_has_the_peaks_of_its_modes():
     gear = dt.Planetary(model="rotational", T_s=1.0, e_s=0.0)
     own = np.unique(np.asarray(dt.modes(gear).natural_frequency).round(6))[1:]

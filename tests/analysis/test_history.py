@@ -89,7 +89,7 @@ LONG = {"element": "input", "equation": "29", "beta": 0.157, "zeta": 1e-9, "chi_
 LONG |= {"phi0": 1e-3, "excitation_frequency": 1000.0}
 
 
-@pytest.mark.parametrize("rtol", [1e-3, 1e-6])
+@pytest.mark.parametrize("rtol", [1e-6, pytest.param(1e-3, marks=pytest.mark.full)])
 def test_long_memory_meets_the_target(rtol):
     """1500 undamped oscillations: steps for a short memory exceed the target 12 to 26 times."""
     omega = float(dt.point("tripod", "parameters", element="input", beta=0.157, chi_n=0.0).natural_angular_frequency)
@@ -102,8 +102,8 @@ def test_long_memory_meets_the_target(rtol):
 @pytest.mark.parametrize(
     ("solver", "frequency", "rtol", "end"),
     [
-        ("Dopri8", 12e3, 1e-5, 0.2),
         ("Dopri8", 20e3, 1e-7, 0.2),
+        pytest.param("Dopri8", 12e3, 1e-5, 0.2, marks=pytest.mark.full),
         ("Tsit5", 40e3, 1e-5, 0.1),
         pytest.param("Kvaerno5", 60e3, 1e-4, 0.1, marks=pytest.mark.full),
     ],
@@ -126,6 +126,7 @@ SMALL_TIMES = [8.599242134871764e-06, 7e-5, 0.00016045592865949728]
 SMALL_PHI = [1.2821017705e-06, 9.8387921093e-05, 4.1201858577e-05]
 
 
+@pytest.mark.full
 def test_errors_are_judged_by_what_the_motion_reaches():
     """A torque with a static twist of 16,000 rad moves the shaft by 1e-4 rad; reference: extrapolation in quadruple
     precision."""

@@ -31,6 +31,7 @@ def assert_homogeneous(found, expected, size, lengths):
 SIZES = [2.0**-1000, 2.0**-600, 2.0**-500, 2.0**600, 2.0**900]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("size", SIZES)
 def test_a_steady_state(size):
     lengths = ["u_max", "u_min", "u_mean", "u_rms", "impact_velocity", "orbit_state", "u_history", "v_history"]

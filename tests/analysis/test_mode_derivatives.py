@@ -110,6 +110,7 @@ def test_turning_the_gear_changes_nothing(jacobian, frequencies):
     assert np.abs(total).max() < 1e-9 * frequencies.max()
 
 
+@pytest.mark.full
 def test_only_a_parameter_splitting_a_doublet_has_no_derivative():
     """With equal spacing the common bearing of planets keeps the translational doublets; an angle splits all six."""
     rows, f = reversed_jacobian(dt.Planetary(**EQUAL))

@@ -71,6 +71,7 @@ def test_labels_do_not_flip_with_tiny_changes_of_spacing():
         assert (rest == first).all()
 
 
+@pytest.mark.full
 def test_labels_at_an_accidental_crossing_of_families():
     """If a rotational and a translational frequency agree to 1e-7, a change of 1e-9 rad mixes the vectors but not the
     labels."""
@@ -155,6 +156,7 @@ def assert_modes(p: dict, frequency: np.ndarray, bound: np.ndarray, shapes: np.n
     assert alone.sum() > 4 and (mac[alone] > 1 - 1e-8).all()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", full_after(1, ["k_p", "m_p", "k_sp"]))
 def test_planets_that_differ_slightly_have_modes_of_their_own(name):
     """Planet modes are split by less than 5e-5; rotated towards their family they would no longer be modes."""
@@ -173,12 +175,14 @@ def test_planets_that_differ_slightly_have_modes_of_their_own(name):
     assert [(ds.mode_type.values[1:] == kind).sum(1).tolist() for kind in (PLANET, RIGID)] == [[9, 9], [1, 1]]
 
 
+@pytest.mark.full
 def test_unequal_planets_at_one_angle():
     given = {name: list(value) for name, value in ONE_ANGLE.items() if isinstance(value, tuple)}
     found = dt.point("planetary", "modes", outputs=FULL, **given).values
     assert_modes(ONE_ANGLE, *(found[key] for key in FULL[:3]))
 
 
+@pytest.mark.full
 def test_followed_frequencies_are_those_of_each_point():
     """The path leads from equal planets to one planet that differs by 1e-5."""
     scene = {
@@ -318,6 +322,7 @@ def test_mac_is_high_and_frequencies_stay_rising(tracked):
     assert tracked["mode"].values.tolist() == list(range(1, 22))
 
 
+@pytest.mark.full
 def test_rigid_modes_are_followed_as_one_space():
     """A gear without bearings has 13 rigid modes; their vectors are arbitrary at each point, but the space moves little."""
     free = dict.fromkeys(("k_p", "k_s", "k_r", "k_c", "k_su", "k_ru", "k_cu"), 0.0)
@@ -344,6 +349,7 @@ def test_refusals():
     assert "not an axis" in refusal(options={"track": "planet_angle[1]"})
 
 
+@pytest.mark.full
 def test_a_path_begins_where_there_are_shapes():
     """Without vectors at the first point the path begins at the second, where the MAC is 1."""
     vectors = np.stack([np.full((2, 2), np.nan), np.eye(2), np.full((2, 2), np.nan), np.eye(2)[:, ::-1]])

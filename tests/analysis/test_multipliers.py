@@ -161,6 +161,7 @@ def test_bound_is_infinite_if_nothing_is_certain(bound, error):
     assert not np.isfinite(bound(roots, np.array([error]))[0])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
 def test_bound_of_other_sizes(n):
     roots = np.linspace(1, -0.5, n)

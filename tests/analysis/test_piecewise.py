@@ -138,6 +138,7 @@ def test_a_lane_that_is_not_finite_does_not_hold_up_the_others():
     assert not np.isfinite(motion.u[1])
 
 
+@pytest.mark.full
 def test_a_history_is_right_however_far_apart_its_times_are():
     """More than 10,000 steps lie between two times; an independent event solver has -.3245944 after half a period."""
     slow = Rattle.models["basins"].build(TABLE1 | {"omega": 1e-4, "c": 1e-3, "alpha": 0.0, "B1": 0.2})

@@ -187,6 +187,7 @@ def test_period_multiple_counts_distinct_points():
     assert period_multiple(series, jnp.float64(1e-9), 500).tolist() == [7, 1, 0, 1]
 
 
+@pytest.mark.full
 def test_torus_residual_sees_noise():
     rng = np.random.default_rng(0)
     angle = (np.sqrt(2) * np.arange(3000)) % (2 * np.pi)

@@ -30,7 +30,7 @@ def exact(values, times, outputs=("u", "v"), **options):
     return dt.history(dt.Rattle(**values), outputs=list(outputs), times=list(times), **options)
 
 
-@pytest.mark.parametrize("case", full_after(6, REFERENCE), ids=lambda case: case["name"])
+@pytest.mark.parametrize("case", full_after(3, REFERENCE), ids=lambda case: case["name"])
 def test_transients_of_the_reference(case):
     """State after whole periods, and the number of crossings until then."""
     values = case["params"] | {"u0": float(case["u0"]), "v0": float(case["v0"])}
@@ -60,6 +60,7 @@ def test_motion_and_events_against_scipy():
     np.testing.assert_allclose(found.event_velocity[:count], rates, atol=1e-8)
 
 
+@pytest.mark.full
 def test_a_full_list_of_events_goes_on_counting():
     found, all_of_them = (exact(GEARS, [60.0], EXACT, most_events=n) for n in (3, 64))
     assert int(found.event_count) == int(all_of_them.event_count) > 3
@@ -92,6 +93,7 @@ def test_a_batch_is_its_points():
             np.testing.assert_allclose(batch[name][i], alone[name], rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.full
 def test_derivatives_by_every_parameter():
     """Derivatives agree with central differences after many contacts and drive periods."""
     times = (5.0, 40.0)
@@ -114,6 +116,7 @@ def averaged(times, **options):
     return found
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("reach", [0.0, 1.0])
 def test_slow_flow_against_the_polar_equations(reach):
     """The slow flow agrees with (42), (43) by SciPy, from the amplitude and phase of the start."""
@@ -144,6 +147,7 @@ def test_slow_flow_against_the_polar_equations(reach):
     np.testing.assert_allclose(found.v, -w0 * other.y[0] * np.sin(0.86 * times - other.y[1]), atol=1e-8)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("sign", [1, -1])
 def test_the_slow_flow_settles_at_the_response(sign):
     """The final amplitude and phase are those of a branch of ``frequency_response``, for a drive of either sign."""

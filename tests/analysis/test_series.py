@@ -61,6 +61,7 @@ def test_entries_elsewhere_where_the_coordinate_is_0_are_noticed():
     assert np.isinf(along(lambda p: LinearPeriodic(lambda t: ((0, 1 + p), (-p, 0)), 1.0), (0.0, 1.0), 1, 4)[1]).all()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("change", "steepest"),
     [

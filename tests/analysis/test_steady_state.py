@@ -287,6 +287,7 @@ def test_a_motion_without_a_fundamental_has_no_phase(steady):
 GENTLE = {"omega": 1.35, "B0": 0.25, "b": 1.0, "c": 0.02, "alpha": 0.25, "k": 1.0, "I": 1.0}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("drive", "above"), [(1e-5, 4.7868552319e-5), (1e-6, 4.786855232e-6), (1e-7, 4.78685528e-7)])
 def test_a_flank_is_passed_however_gently(drive, above):
     """About a rest on the flank motions are similar at any scale; reference: Taylor series with 64 bits."""

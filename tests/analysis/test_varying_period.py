@@ -80,6 +80,7 @@ def test_one_point_a_batch_and_the_derivative():
     np.testing.assert_allclose(dt.floquet(InSeconds(speed=2.05)).spectral_radius, turns[2], rtol=1e-12)
 
 
+@pytest.mark.full
 def test_a_period_that_is_not_positive_has_no_value():
     speeds = jnp.array([0.0, -1.0, math.nan, 1.0])
     found = jax.vmap(lambda speed: dt.floquet(InSeconds(speed=speed)).spectral_radius)(speeds)

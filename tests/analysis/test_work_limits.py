@@ -54,6 +54,7 @@ def assert_ends(name: str, decades: float, count: int, seed: int = 0) -> None:
             assert np.isfinite(values.where(found.outcome == Outcome.SUCCESS, 0.0)).all(), key
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", but_full(CASES, "lyapunov", "poincare", "adaptive section", "forced"))
 def test_the_widest_points_end(name):
     assert_ends(name, 300, FEW)

@@ -185,6 +185,7 @@ def test_a_check_follows_the_ridge_of_a_narrow_tongue():
     assert answer.check.agrees and answer.check.beyond > 1 + 1e-9
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("ask", "ranges", "fixed", "speeds", "ends", "safe_end"),
     [

@@ -307,6 +307,7 @@ def test_undamped_boundaries_separate_bounded_and_growing_motion(undamped):
     assert np.abs(np.linalg.eigvals(z) + 1).min() < 1e-2
 
 
+@pytest.mark.full
 def test_limits_without_damping_allow_for_a_loose_atlas():
     """Multipliers that meet on the unit circle leave it by the root of the atlas's error, in other tongues by more."""
     fixed = {**BASE, "zeta": 0.0, "gamma": 1.0}
@@ -332,6 +333,7 @@ def test_the_gradient_of_a_tip():
     assert -slopes["mu"] / slopes["beta"] == pytest.approx(difference, rel=2e-2)
 
 
+@pytest.mark.full
 def test_gradients_of_the_radius():
     point = {**BASE, "beta": 0.9, "Omega": 0.71}
     # Without damping all four multipliers lie on the circle, and derivatives of the radius are rounding.

@@ -319,6 +319,7 @@ def test_a_home_folder_may_be_written_as_one(monkeypatch, folder, capsys):
         dt.open_result("~/r.nc")
 
 
+@pytest.mark.full
 def test_a_point_that_has_not_converged_names_the_option():
     gears = {"omega": 0.7, "B0": 0.05, "B1": 0.03, "b": 0.17, "c": 1e-5, "alpha": 0.25, "k": 1.0, "I": 1.0}
     found = dt.point("rattle", "steady_state", **gears, most_periods=64)

@@ -162,6 +162,7 @@ def test_chunks_of_even_axes_reach_along_those_of_low_degree(deep):
     assert panel.degrees[names.index(shortest)] == max(panel.degrees)
 
 
+@pytest.mark.full
 def test_many_small_rectangles_are_evaluated_together(deep, monkeypatch):
     """With the numbers of single points, also where eigenvalues decide."""
     stability, calls, shared = dt.open_atlas(deep).stability, [], []

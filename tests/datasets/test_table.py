@@ -34,6 +34,7 @@ def test_every_number_is_in_its_column(file, monkeypatch, rows):
     assert (found.outcome == "success").all()
 
 
+@pytest.mark.full
 def test_complex_numbers_have_two_columns(tmp_path):
     shaft = dt.Cardan(beta=0.3, Omega=1.4, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)
     over = {"Omega": [1.2, 1.415]}

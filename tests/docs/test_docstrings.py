@@ -13,9 +13,10 @@ from tests.sizes import but_full
 
 EXCEPTIONS = {"ChunkError", "Incomplete", "InputError", "Interrupted"}
 NAMES = [name for name in dt.__all__ if name != "__version__" and name not in EXCEPTIONS]
+SLOW = "Planetary", "basins", "forced", "harmonic_response", "lyapunov", "poincare", "steady_state"
 
 
-@pytest.mark.parametrize("name", but_full(NAMES, "Planetary", "basins", "forced", "lyapunov", "poincare"))
+@pytest.mark.parametrize("name", but_full(NAMES, *SLOW))
 def test_examples_give_what_they_show(name):
     item = getattr(dt, name)
     scope = dict(vars(sys.modules[item.__module__]))

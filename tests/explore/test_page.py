@@ -78,6 +78,7 @@ def corners():
     return [np.array([x, y]) for x in (-1, 0, 1) for y in (-1, 0, 1)]
 
 
+@pytest.mark.full
 @needs_node
 def test_resonances_are_those_of_the_system(atlases, two, tmp_path):
     from drivetrain_jax.resonances.cardan import RESONANCES

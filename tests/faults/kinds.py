@@ -44,7 +44,7 @@ KINDS: tuple[tuple[str, Callable[[Bench, str], Record], int, bool], ...] = (
     ("limit of a file's size", file_limit, 2, False),
     ("file system turns read-only", read_only, 2, False),
     ("read-only folder", read_only_folder, 1, False),
-    ("folder of parts vanishes", lambda b, k: vanished(b, k, whole=False), 2, True),
+    ("folder of parts vanishes", lambda b, k: vanished(b, k, whole=False), 2, False),
     ("output's folder vanishes", lambda b, k: vanished(b, k, whole=True), 1, False),
     ("two runs on one output", two_runs, 2, False),
     ("bit flips in parts", lambda b, k: corrupted(b, k, flip), 3, False),

@@ -113,6 +113,7 @@ def truck(tmp_path_factory):
     return folder / "stability.nc", folder / "forced.nc"
 
 
+@pytest.mark.full
 def test_units_are_those_asked_for_or_those_of_the_scene(truck, tmp_path):
     out = tmp_path / "report.html"
     assert main(["report", *map(str, truck), "--out", str(out), "--units", "Hz,mrad"]) == 0

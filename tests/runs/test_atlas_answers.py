@@ -42,6 +42,7 @@ def panels(beta: tuple, omega: tuple, rtol: float = 1e-9, zeta: float = 0.001, g
     )
 
 
+@pytest.mark.full
 def test_an_atlas_answers_with_multipliers_as_well():
     axes = {"beta": {"start": 0.2, "stop": 0.4}, "Omega": {"start": 1.3, "stop": 1.5}}
     fixed = {"zeta": 0.01, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
@@ -63,6 +64,7 @@ def test_the_widest_angle_has_no_sign(beta):
     assert answer["value"] == pytest.approx(S21[0], abs=1e-8) and answer["check"]["agrees"]
 
 
+@pytest.mark.full
 def test_boundaries_lie_on_both_sides_of_the_angle_0():
     """At a speed next to the tip of S21 the system is stable between the edges at both signs of the angle."""
     atlas, at = atlas_of((-0.2, 0.3), (1.3, 1.5)), {"beta": -0.15, "Omega": 1.42}
@@ -145,6 +147,7 @@ def columns(count: int, zeta: float = 0.001) -> dict[str, np.ndarray]:
     return {name: np.full(count, x) for name, x in {"zeta": zeta, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}.items()}
 
 
+@pytest.mark.full
 def test_a_chart_over_the_angle_0_has_curves_and_tips_on_both_sides():
     source = panels((-0.2, 0.3), (1.3, 1.5))
     drawn = chart(source, {}, 20)
@@ -301,6 +304,7 @@ def test_an_answer_names_the_kinds_of_its_ends(speeds, kind, value):
         assert found["error"] is None and value < S21[0] and " (undecided beyond)\n  not certain" in str(reply)
 
 
+@pytest.mark.full
 def test_a_slowly_resolved_boundary_function_is_not_taken_for_rounding():
     """Of this shaft five patches hardly resolve more than three: all speeds were undecided."""
     given = {"J1": 1.2, "J2": 0.35, "k1": 3e4, "k2": 2.5e4, "c1": 2.0, "c2": 0.3, "angle": "15 deg"}
@@ -365,6 +369,7 @@ def test_answers_without_damping_agree_with_direct_solves():
     assert len(windows) >= 5 and all(window["check"]["agrees"] for window in windows)
 
 
+@pytest.mark.full
 def test_without_damping_tips_are_at_the_angle_0():
     source = panels((0.0, 1.2), (0.3, 2.0), zeta=0.0)
     assert {"S21", "H21", "C+1"} <= set(chart(source, {}, 20)["tip"].values)

@@ -109,6 +109,7 @@ def test_an_integer_is_no_range_of_an_atlas(monkeypatch):
         atlas_choice.choose_atlas(load_scene(chart | {"options": {"method": "atlas"}}))
 
 
+@pytest.mark.full
 def test_an_integer_has_no_sensitivity():
     point = {"omega": 1.1, "depth": 0.3, "mass": 1.0, "order": 1}
     found = dt.point("pendulum", "floquet", sensitivities=True, **point)

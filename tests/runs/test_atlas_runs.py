@@ -259,6 +259,7 @@ def test_labelled_arrays_keep_their_labels_and_must_agree(atlas):
         atlas(beta=beta, Omega=xr.DataArray([1.1, 1.2], dims="shaft", coords={"shaft": ["b", "c"]}))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("outputs", full_after(1, [["floquet_multiplier", "verdict"], ["spectral_radius"]]))
 def test_an_atlas_without_a_panel_has_all_its_points_solved(monkeypatch, tmp_path, outputs):
     monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
@@ -269,6 +270,7 @@ def test_an_atlas_without_a_panel_has_all_its_points_solved(monkeypatch, tmp_pat
         assert_same_arrays(found, exact)
 
 
+@pytest.mark.full
 def test_values_that_coincide_in_the_coordinates_of_an_atlas():
     """The speeds differ by a rounding, and the squares of the angles underflow."""
     for axes in (
@@ -448,6 +450,7 @@ def test_a_system_without_boundary_functions_has_values_and_charts(atlas, stored
     assert not [name for name in chart(stored, {}, 5).coords if name.startswith(("boundary", "tip"))]
 
 
+@pytest.mark.full
 def test_least_damping_of_a_range_of_speeds():
     axes = {"Omega": {"start": 1.3, "stop": 1.6}, "zeta": {"start": 0.0, "stop": 0.05}}
     fixed = {name: value for name, value in BASE.items() if name != "zeta"}

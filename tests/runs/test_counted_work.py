@@ -183,6 +183,7 @@ def test_steps_of_rattle():
     assert not complaint("steps rattle", int(steps(omega).sum()))
 
 
+@pytest.mark.full
 def test_steps_of_a_history(monkeypatch, tally):
     plain = diffrax.diffeqsolve
 

@@ -65,6 +65,7 @@ def drivetrain(package, tmp_path):
     return start
 
 
+@pytest.mark.full
 def test_two_stores_of_one_scene_are_written_by_the_same_workers(tmp_path):
     """Workers keep the computation of the last run, which must not decide where the next one writes."""
     scene = {"system": "planetary", "analysis": "modes", "outputs": ["natural_frequency"]}

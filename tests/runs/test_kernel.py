@@ -150,6 +150,7 @@ def test_scenes_of_few_points_are_compiled_without_optimising(monkeypatch):
     assert given == [True, False, False, False, False]
 
 
+@pytest.mark.full
 def test_other_fixed_numbers_need_no_compilation():
     dt.run(chart("direct"))
     before = kernel._compiled.cache_info().misses

@@ -118,6 +118,7 @@ def test_one_quantity_may_change_several_parameters():
         assert found.amplitude.values[i] == pytest.approx(np.asarray(alone.amplitude), rel=1e-9)
 
 
+@pytest.mark.full
 def test_points_may_vary_any_data():
     points = {"speed": [1425, 1000], "J1": [2.0, 1.0], "angle": ["12 deg", 10]}
     fixed = {name: value for name, value in TRUCK.items() if name != "J1"}
@@ -150,6 +151,7 @@ def test_what_is_wrong_with_data_of_a_scene():
         dt.run(cardan(axes={"c1": [0.1, 0.2]}, fixed=fixed, options={"method": "atlas"}))
 
 
+@pytest.mark.full
 def test_gears_rest_where_the_mean_torque_presses_them():
     """Without a harmonic torque: u = b + T/(r_x k). The parameters: two rigid gears, the load balances the mean torque."""
     gears = dt.Rattle.from_physical(**GEARS, speed=3000)
@@ -173,6 +175,7 @@ def test_two_gears_move_as_the_oscillator():
     assert float(found[1]) == pytest.approx(0.05 * driving - 0.1 * driven, rel=1e-12)
 
 
+@pytest.mark.full
 def test_a_frequency_response_over_the_speed():
     scene = {"system": "rattle", "analysis": "frequency_response", "fixed": GEARS, "outputs": ["u_max"]}
     found = dt.run({**scene, "axes": {"speed": {"start": 600, "stop": 6000, "num": 5}}})

@@ -30,6 +30,7 @@ def boundary(data: dict, near: float) -> float:
     return brentq(lambda speed: radius(data | {"speed": speed}) - 1, near - 2, near + 2, xtol=1e-9)
 
 
+@pytest.mark.full
 def test_limits_move_as_those_of_changed_shafts(atlas):
     found = atlas_answers.speed_windows(atlas, {})
     window = found.data["windows"][0]

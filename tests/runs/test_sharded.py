@@ -247,6 +247,7 @@ class Crashing(InTurn):
             yield task, None if crash else computation.compute(task)
 
 
+@pytest.mark.full
 def test_only_the_chunk_that_crashes_its_worker_is_lost(grid_scene, tmp_path, monkeypatch):
     """The shares of a task that crashes are tried alone, then the chunks of the crashing share."""
     monkeypatch.setattr("drivetrain_jax.store.shards.Shards.of", lambda *_: shards.Shards((40, 41), (1, 20)))
@@ -259,6 +260,7 @@ def test_only_the_chunk_that_crashes_its_worker_is_lost(grid_scene, tmp_path, mo
     assert 0 < lost.sum() <= 20 and ours.value.values[~lost].tobytes() == whole.value.values[~lost].tobytes()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("which", ["grid", "line"])
 def test_written_shards_of_unfinished_work_are_counted_opened_and_resumed(grid_scene, tmp_path, monkeypatch, which):
     """A worker writes a whole block without a part."""

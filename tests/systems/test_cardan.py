@@ -317,6 +317,7 @@ def test_predicted_steps_are_enough_and_not_many_more(point, rtol):
     assert stable_steps(form) < predicted
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("rtol", full_after(1, [1e-9, 1e-7, 1e-10]))
 def test_slow_points_meet_their_tolerance_in_predicted_steps(rtol):
     """Slightly too few steps would repeat the march with twice as many, and cost 2.6 times the time of a block."""

@@ -45,6 +45,7 @@ def test_lists_have_one_entry_per_planet():
     assert str(refusal.value) == said
 
 
+@pytest.mark.full
 def test_rotations_of_four_planets():
     """Four frequencies are distinct, and the frequency of planets alone is triple: (39), (40)."""
     found = dt.modes(dt.Planetary(model="rotational"), outputs=EVERYTHING)
@@ -82,8 +83,8 @@ def test_rotations_are_the_plane_gear_with_its_centres_held(count, given, method
     "given",
     [
         {"pressure_angle_s": 0.35, "pressure_angle_r": 0.5},
-        {"pressure_angle_s": 0.35},
-        {"k_sx": 2e8, "k_sy": 5e7, "k_rx": 3e8, "k_cy": 4e8},
+        pytest.param({"pressure_angle_s": 0.35}, marks=pytest.mark.full),
+        pytest.param({"k_sx": 2e8, "k_sy": 5e7, "k_rx": 3e8, "k_cy": 4e8}, marks=pytest.mark.full),
         {"k_sy": 0.0, "pressure_angle_r": 0.1, "m_p": (0.6, 0.66, 0.7, 0.5), "k_p": (1e8, 2e8, 1e8, 3e8)},
     ],
 )
@@ -129,6 +130,7 @@ def test_derivatives_by_the_new_parameters():
             np.testing.assert_allclose(slope[known], numeric[known], atol=1e-6 * np.abs(numeric).max())
 
 
+@pytest.mark.full
 def test_one_of_five_planets_3_degrees_off():
     """By the exact label nearly all modes are coupled; the dominant family and its share characterise them."""
     angles = tuple(np.radians([0, 75, 144, 216, 288]))

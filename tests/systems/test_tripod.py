@@ -164,6 +164,7 @@ def test_exponents_need_a_time_in_seconds():
         load_scene(scene)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("method", ["direct", "diffrax"])
 def test_both_exponents_of_a_strongly_damped_element(method):
     zetas = np.array([0.5, 1.5, 5.0, 10.0, 100.0])
@@ -214,6 +215,7 @@ def test_least_chi_n_that_makes_the_element_unstable(case):
     assert bend < 0 and abs(along / bend) < 1e-4
 
 
+@pytest.mark.full
 def test_least_chi_n_at_the_lowest_damping_of_the_paper():
     """The tip lies 6.68 times above the nonuniformity .0026 that the paper states (docs/theory/tripod.md)."""
     chi_n = 0.0173632641

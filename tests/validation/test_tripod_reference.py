@@ -18,6 +18,7 @@ ELEMENT = {"25": "input", "29": "input", "26": "output", "30": "output"}
 FLOQUET = {key: case for key, case in REFERENCE["floquet_vs_benettin"].items() if not key.startswith("est")}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("equation", full_after(2, ["25", "30", "26", "29"]))
 def test_states(equation):
     """phi and V agree with every reference history to 1e-8 of their scale."""
@@ -94,6 +95,7 @@ def test_no_instability_in_the_range_of_the_paper():
     assert -13.3 < float(ds.floquet_exponent.max()) < -13.1
 
 
+@pytest.mark.full
 def test_critical_nonuniformity_separates_stable_from_unstable():
     """Just below the tip no frequency is unstable; just above the tip its frequency is unstable."""
     case = REFERENCE["critical_chi_n"][0]

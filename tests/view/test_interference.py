@@ -49,6 +49,7 @@ def test_without_teeth_no_order_is_known():
     assert orders_of("cardan", {}) is None
 
 
+@pytest.mark.full
 def test_a_rigid_motion_alone_has_no_meeting():
     """Selected alone, it is its own largest frequency; computed, it is not exactly 0."""
     found = dt.run({"system": "planetary", "analysis": "modes", "fixed": {"teeth": [20, 26, 72]}})
