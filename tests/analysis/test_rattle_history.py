@@ -116,7 +116,6 @@ def averaged(times, **options):
     return found
 
 
-@pytest.mark.full
 @pytest.mark.parametrize("reach", [0.0, 1.0])
 def test_slow_flow_against_the_polar_equations(reach):
     """The slow flow agrees with (42), (43) by SciPy, from the amplitude and phase of the start."""
