@@ -19,6 +19,7 @@ from drivetrain_jax.analysis.impacts.piecewise_march import (
     prepare,
     start,
 )
+from drivetrain_jax.analysis.numerics.kernels import stored
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 DRIVE, BACK, NO_EVENT = range(3)
@@ -85,7 +86,8 @@ def _moved(lanes: Lanes, walk: _Walk, target: tuple[Array, Array], active: Array
     d = next_step(*jax.lax.stop_gradient((lanes, here, motion)))
     d = jnp.where(d >= lanes.period - motion.time, lanes.period - motion.time, d)
     d = jnp.where(-motion.left == whole, jnp.minimum(d, part - motion.time), d)
-    moved = advance(lanes, here, motion, d)
+    # Stored: computed once more with another rounding, a displacement on a flank would be kept and yet not be an event.
+    moved = stored(advance)(lanes, here, motion, d)
     after = locate(lanes, moved.u).side
     crosses = active & (after != here.side)
     flank = jnp.where(here.side + after > 0, DRIVE, BACK).astype(jnp.int8)
