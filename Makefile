@@ -15,10 +15,10 @@ atlas: $(VENV)/installed  ## the quickstart chart and its figure, in out/
 	$(BIN)/drivetrain plot $(OUT)/quickstart.nc --out $(OUT)/quickstart.png
 
 test: $(VENV)/installed-test lint  ## all tests in their short form
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not full"
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not full and not docs"
 
 validate: $(VENV)/installed-test  ## the comparisons at full size
-	$(BIN)/python -m pytest -m full
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m full
 
 faults: $(VENV)/installed-test  ## real faults at random moments; writes the table of docs/reliability.md
 	$(BIN)/python tests/faults/suite.py
@@ -43,7 +43,8 @@ validation: $(VENV)/installed-bench  ## regenerates docs/validation/
 gallery: $(VENV)/installed  ## every scene of sweeps/ and its figure, in out/gallery/
 	$(BIN)/python docs/gallery.py $(OUT)/gallery
 
-docs: $(VENV)/installed-docs  ## the documentation site, in out/docs/html: no warnings, links within it checked, examples run
+docs: $(VENV)/installed-docs $(VENV)/installed-test  ## the documentation site, in out/docs/html: no warnings, links, examples, commands and generated parts checked
+	$(BIN)/python -m pytest -n 2 -m docs
 	$(BIN)/python -m sphinx -q -W --keep-going -b html -d $(OUT)/docs/doctrees docs $(OUT)/docs/html
 	$(BIN)/python -m sphinx -q -W --keep-going -b doctest -d $(OUT)/docs/doctrees docs $(OUT)/docs/doctest
 

@@ -1,34 +1,118 @@
-"""Limits of time and memory of a test process: a newcomer's computer has 8 GB, and `make test` runs two of them."""
+"""Budgets of a test run: CPU time of each test and of all, memory of each process, and one cache of compiled code.
+
+A newcomer's computer has two slow cores and 8 GB, and `make test` runs two processes.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import gc
 import os
+import resource
+import shutil
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
+# Limits in reference seconds: of one test that is not marked `full`, and of a whole run of `make test` and `make validate`.
+LONGEST, TOTAL = 5.0, {"not full and not docs": 950.0, "full": 9000.0}
+# CPU seconds of `reference` on the machine that the limits refer to: there the tests of d7ff433 took 2,300 s.
+REFERENCE = 0.081
 # Growth that a compilation leaves behind, and resident memory above which compiled code is dropped, in bytes.
 GROWTH, LIMIT = 200 << 20, 1 << 30
+# Size of the cache of compiled code at which it begins anew, in bytes.
+CACHE = 1 << 30
 _after_trim = 0
 
 
 def pytest_configure(config):
     """`make test` compiles without optimisation, in half of the time; `make validate` compiles as users do."""
-    if config.getoption("markexpr") == "not full":
-        os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+    if config.getoption("markexpr") != "full":
+        os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+    if config.pluginmanager.hasplugin("cacheprovider"):
+        compiled = Path(config.cache.mkdir("compiled"))
+        if not hasattr(config, "workerinput") and sum(f.stat().st_size for f in compiled.iterdir()) > CACHE:
+            shutil.rmtree(compiled)
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(compiled))
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.05")
+    # Nobody reads where the operations of a test come from: 2.5 % of tracing and compiling.
+    os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
+    # Traces leave many objects and hardly any garbage.
+    gc.set_threshold(50_000, 20, 50)
+    config.pluginmanager.register(Budget(config))
 
 
-@pytest.fixture(autouse=True, scope="session")
-def no_stored_programs():
-    """A test that replaces code must not leave its program to later runs; processes that tests start do store programs."""
-    from drivetrain_jax import _compile_cache
+def reference() -> float:
+    """CPU seconds of a computation of about a twentieth of a second in plain Python."""
+    begin, table = time.process_time(), {}
+    for i in range(200_000):
+        table[str(i % 997)] = (i * 7919) % 10007
+    sorted(range(100_000), key=lambda i: (i * 7919) % 10007)
+    return time.process_time() - begin
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_compile_cache, "programs", lambda: None)
-        yield
+
+def cpu(who: int) -> float:
+    used = resource.getrusage(who)
+    return used.ru_utime + used.ru_stime
+
+
+class Budget:
+    """Counts the CPU time of tests in reference seconds, and fails what exceeds its limit.
+
+    A test is not charged for compilation, because that meets the test that happens to come first.
+    """
+
+    def __init__(self, config: pytest.Config):
+        self.unit = min(reference() for _ in range(3)) / REFERENCE
+        self.total, self.limit = 0.0, TOTAL.get(config.getoption("markexpr"))
+        self.spans: list[tuple[float, float]] = []
+
+    def heard(self, event: str, seconds: float, **_: object) -> None:
+        """Note the wall time of a trace or compilation, which includes those within it."""
+        if event.startswith("/jax/core/compile/"):
+            end = time.monotonic()
+            while self.spans and self.spans[-1][0] >= end - seconds:
+                self.spans.pop()
+            self.spans.append((end - seconds, end))
+
+    def measured(self, item: pytest.Item):
+        if (jax := sys.modules.get("jax")) and not self.spans:
+            jax.monitoring.register_event_duration_secs_listener(self.heard)
+            self.spans.append((0.0, 0.0))
+        begin, own, children = time.monotonic(), cpu(resource.RUSAGE_SELF), cpu(resource.RUSAGE_CHILDREN)
+        result = yield
+        wall = max(time.monotonic() - begin, 1e-9)
+        compiling = sum(end - start for start, end in self.spans if start >= begin)
+        seconds = (cpu(resource.RUSAGE_SELF) - own) * max(1 - compiling / wall, 0)
+        seconds = (seconds + cpu(resource.RUSAGE_CHILDREN) - children) / self.unit
+        if seconds > LONGEST and not any(item.get_closest_marker(name) for name in ("full", "docs")):
+            pytest.fail(
+                f"{seconds:.1f} reference seconds, expected at most {LONGEST}: shorten or mark full", pytrace=False
+            )
+        return result
+
+    pytest_runtest_setup = pytest.hookimpl(wrapper=True)(measured)
+    pytest_runtest_call = pytest.hookimpl(wrapper=True)(measured)
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_testnodedown(self, node):
+        self.total += getattr(node, "workeroutput", {}).get("reference_seconds", 0.0)
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_sessionfinish(self, session):
+        # Workers count themselves; to the process that starts them they are children.
+        alone = not session.config.getoption("numprocesses", None)
+        self.total += (cpu(resource.RUSAGE_SELF) + alone * cpu(resource.RUSAGE_CHILDREN)) / self.unit
+        if hasattr(session.config, "workerinput"):
+            session.config.workeroutput["reference_seconds"] = self.total
+        elif self.limit and self.total > self.limit:
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+    def pytest_terminal_summary(self, terminalreporter):
+        allowed = f", expected at most {self.limit:.0f}" if self.limit else ""
+        terminalreporter.write_line(f"{self.total:.0f} reference seconds of CPU time{allowed}")
 
 
 def resident() -> int:

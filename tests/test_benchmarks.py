@@ -17,9 +17,6 @@ from benchmarks import (
     page_aims,
     page_precision,
     page_sections,
-    precision_attractors,
-    precision_forced,
-    precision_planetary,
 )
 from benchmarks.page_text import NAMES, PAGE, conclusions, text_of
 from benchmarks.precision import Contender, Judged, Rung, judge, measure, read, write
@@ -27,13 +24,8 @@ from benchmarks.ratio_figure import ratios
 from benchmarks.results_files import ResultFile, against, not_measured, plain
 from benchmarks.timing import RESULTS, at_once, once, provenance, write_csv
 from drivetrain_jax import cli
-from tests.oracles.bicardan_precise_reference import determinant
-from tests.oracles.bicardan_reference import transfer_determinant
-from tests.oracles.cardan_orbit_reference import nonlinear_orbit
-from tests.oracles.cardan_reference import BASE_CASE, monodromy, spectral_radius, stacked_half_period_monodromy
-from tests.oracles.chaos_reference import _orthonormalise
-from tests.oracles.planetary_reference import extension_matrix
-from tests.oracles.rattle_reference import scipy_events
+
+pytestmark = pytest.mark.docs
 
 
 def rung(setting="rtol=1e-9", error=1e-10, failed=0, noticed=""):
@@ -61,16 +53,6 @@ def test_an_accelerator_is_measured_or_there_was_none(tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_PLATFORMS", "")
     with pytest.raises(SystemExit, match="jax finds none"):
         accelerator.measure(tmp_path, quick=True)
-
-
-def test_half_a_period_gives_the_radius_of_a_whole_one():
-    """SciPy gets the same form of the problem as the package and heyoka."""
-    columns = {name: np.full(3, value) for name, value in (BASE_CASE | {"zeta": 0.05, "alpha": 2.0}).items()}
-    columns |= {"beta": np.array([0.3, 1.0, 1.4]), "Omega": np.array([1.4, 0.4, 0.9])}
-    points = [{name: column[i] for name, column in columns.items()} for i in range(3)]
-    expected = [spectral_radius(monodromy(point)) for point in points]
-    found = spectral_radius(stacked_half_period_monodromy(columns, 1e-12, 1e-12))
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize(("error", "fails"), [(1e-10, False), (1.0, True)])
@@ -153,24 +135,6 @@ def test_results_name_their_commit_and_the_load_by_others():
     facts = provenance()
     assert re.fullmatch(r"([0-9a-f]{7,}( with changes)?)|unknown", facts["commit"])
     assert re.fullmatch(r"\d+\.\d\d cores by other programs|unknown", facts["load"])
-
-
-@pytest.mark.full
-def test_rivals_of_the_forced_motion_and_of_attractors_find_it():
-    """The references of the new studies, against each other."""
-    region = precision_forced.REGIONS["orbit"]
-    found = precision_forced.scipy_shooting(region, 1e-9)
-    np.testing.assert_allclose(found, nonlinear_orbit(region.point)[0], rtol=0, atol=1e-9 * np.abs(found).max())
-    values = precision_attractors.REGIONS["attractor, both flanks"]
-    periods = precision_attractors.periods_to(values, 1e-6)
-    states = np.array([scipy_events(values, 0.0, 0.0, periods, 1e-7)])
-    assert precision_attractors.error_of("attractor, both flanks", states).error < 1e-5
-
-
-def test_exact_shapes_are_those_of_lapack():
-    gear = precision_planetary.TABLE_2 | {"planet_angle": (0.0, 1.9, 4.4)}
-    squares = extension_matrix(gear).T @ extension_matrix(gear)
-    assert precision_planetary.shape_error(gear, np.linalg.eigh(squares)[1].T).error < 1e-11
 
 
 def test_a_page_without_any_file_says_so(tmp_path):
@@ -302,20 +266,3 @@ def test_every_study_is_a_module_of_the_benchmarks():
 
     assert all((ROOT / "benchmarks" / f"{study.module}.py").is_file() for study in STUDIES)
     assert {study.system for study in STUDIES} == set(SYSTEMS)
-
-
-def test_rivals_vectors_are_orthonormal_as_lapack_makes_them():
-    vectors = np.random.default_rng(0).normal(size=(2, 3, 3, 5))
-    lapack = np.abs(np.diagonal(np.linalg.qr(vectors.transpose(0, 3, 2, 1))[1], axis1=-2, axis2=-1))
-    lengths = _orthonormalise(vectors)
-    assert np.abs(np.moveaxis(lengths, 0, -1) / lapack - 1).max() < 1e-13
-    products = np.einsum("mica,mjca->maij", vectors, vectors)
-    assert np.abs(products - np.eye(3)).max() < 1e-13
-
-
-def test_the_plain_determinant_is_that_of_many_digits():
-    shaft = {"length": (0.07, 0.59, 0.25), "EI": (64427.2, 22156.5, 8349.76), "rhoA": (15.288, 2.808, 5.5068)}
-    shaft |= {"k_A": 85e6, "k_D": 20e6}
-    for p in (100.0, 1500.0, 9000.0):
-        exact = float(determinant(p**0.5, shaft)) * (1 + shaft["k_A"]) * (1 + shaft["k_D"])
-        assert abs(transfer_determinant(p, shaft) / exact - 1) < 1e-11

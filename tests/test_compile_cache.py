@@ -31,7 +31,10 @@ def tiny(x):
 
 jax.jit(tiny)(1.0)
 """
-OWN = ("DRIVETRAIN_JAX_CACHE", "XDG_CACHE_HOME", "JAX_ENABLE_X64")
+OWN = (
+    *("DRIVETRAIN_JAX_CACHE", "XDG_CACHE_HOME", "JAX_ENABLE_X64"),
+    *("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"),
+)
 
 
 def folder_used(script: str, **environment: str) -> str:

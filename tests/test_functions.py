@@ -103,7 +103,10 @@ OPTIONS = {
 }  # fmt: skip
 
 
-SLOW = "cardan forced", "tripod poincare", "tripod lyapunov", "rattle frequency_response"
+SLOW = (
+    *("cardan forced", "tripod history", "tripod lyapunov", "tripod poincare", "rattle frequency_response"),
+    *("bicardan critical_speeds", "planetary harmonic_response", "planetary modes"),
+)
 
 
 @pytest.mark.parametrize(
@@ -377,6 +380,7 @@ for call in (lambda: dt.critical_speeds(gears), lambda: dt.sweep(dt.critical_spe
     subprocess.run([sys.executable, "-c", code], check=True, env=own)
 
 
+@pytest.mark.full
 def test_a_result_and_a_gradient_show_their_numbers():
     found = dt.floquet(SHAFT, outputs=["spectral_radius"])
     assert re.fullmatch(r"Result\(outcome=0, spectral_radius=1\.03193549\d+\)", repr(found))

@@ -10,6 +10,8 @@ import pytest
 from benchmarks.readme import written
 from benchmarks.results_files import not_measured
 
+pytestmark = pytest.mark.docs
+
 ROOT = Path(__file__).parents[1]
 
 

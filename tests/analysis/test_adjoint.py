@@ -55,6 +55,7 @@ def rotated(values):
     return turn(values["low"], 2.0 - values["jump"]) @ turn(values["high"], values["jump"])
 
 
+@pytest.mark.full
 def test_gradients_include_the_motion_of_a_jump():
     weights = jnp.array([[[1.0, -2.0], [0.3, 0.7]]])
     exact = jax.grad(lambda values: jnp.sum(weights[0] * rotated(values)))(SWING)

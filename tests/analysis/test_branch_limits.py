@@ -29,6 +29,7 @@ def branch(method):
     return np.isfinite(found["branch_u_max"]).sum(axis=1), np.asarray(found["outcome"])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("method", "module"),
     [pytest.param("exact", exact_branch, marks=pytest.mark.full), ("harmonic_balance", harmonic_response)],

@@ -148,6 +148,7 @@ def test_the_largest_self_consistent_range_is_taken(alpha):
         assert peak[0] == pytest.approx(reach, rel=1e-9)
 
 
+@pytest.mark.full
 def test_self_consistent_range_is_the_peak_it_gives(scales):
     reach = multiple_scales.self_consistent_range(MODEL, ())
     peak = multiple_scales.peak(multiple_scales.slow_flow(MODEL, multiple_scales.cubic_fit(MODEL, reach)))
@@ -156,7 +157,7 @@ def test_self_consistent_range_is_the_peak_it_gives(scales):
     assert scales["peak_amplitude"][0, 0] == pytest.approx(float(reach), rel=1e-12)
 
 
-@pytest.mark.parametrize("name", ["B1", "b", "c", "alpha", "k"])
+@pytest.mark.parametrize("name", full_after(1, ["B1", "b", "c", "alpha", "k"]))
 def test_one_parameter_may_vary_alone(name):
     """One to three lanes of a single parameter, with numbers for the others, give the same as arrays of all parameters."""
     # With 1.3 times this drive there are three self-consistent ranges, the largest nearly twice the next one.
@@ -242,6 +243,7 @@ def assert_balanced(values, omega, bias, amplitude, rtol=1e-9):
     assert size == pytest.approx(values["B1"], rel=rtol * max(1.0, amplitude / values["B1"]))
 
 
+@pytest.mark.full
 def test_amplitudes_on_both_sides_of_a_narrow_resonance():
     """At light damping both arms cross a frequency within a thousandth of an amplitude."""
     values = {"B0": 0.14, "B1": 1.4e-4, "b": 0.63, "c": 1.2e-4, "alpha": 0.0}

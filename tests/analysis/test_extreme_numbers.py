@@ -16,17 +16,17 @@ from drivetrain_jax.invariants import check
 from drivetrain_jax.systems import get_system
 
 POINTS, MANY = 32, 2048
-# Largest sizes: numbers that only just have squares and fourth powers, and the largest of all.
-SIZES = 1e20, 1e300
+# Largest size: numbers that have squares and fourth powers.
+LARGEST = 1e20
 STEEP = np.nextafter(math.pi / 2, 0.0)
 PATH = np.array([1e-18, 1e-3, 0.5, 0.9, 1.3, 1e19])
 # Amplitudes and ranges are infinite without damping, and an unknown error has an infinite bound.
 INFINITE = {"peak_amplitude", "fit_range", "spectral_radius_error"}
 
 
-def size(rng, count, largest, centre=1.0, zero=0.1, signed=False):
+def size(rng, count, centre=1.0, zero=0.1, signed=False):
     """Usual numbers, numbers of any size, coincident ones and zeros."""
-    any_size = np.exp(rng.uniform(-1, 1, count) * math.log(largest))
+    any_size = np.exp(rng.uniform(-1, 1, count) * math.log(LARGEST))
     usual = centre * np.exp(rng.uniform(-7, 7, count))
     kind = rng.random(count)
     found = np.select([kind < 0.4, kind < 0.45], [usual, np.full(count, centre)], any_size)
@@ -34,38 +34,38 @@ def size(rng, count, largest, centre=1.0, zero=0.1, signed=False):
     return found * rng.choice([-1, 1], count) if signed else found
 
 
-def cardan(rng, count, largest):
+def cardan(rng, count):
     ends = [0.0, 1e-300, 1e-8, STEEP, -STEEP, 1.5]
     beta = np.where(rng.random(count) < 0.3, rng.choice(ends, count), rng.uniform(-1.57, 1.57, count))
-    mu = np.where(rng.random(count) < 0.3, 1.0, size(rng, count, largest, zero=0))
-    rest = {name: size(rng, count, largest, centre) for name, centre in (("zeta", 1e-2), ("alpha", 1.0))}
+    mu = np.where(rng.random(count) < 0.3, 1.0, size(rng, count, zero=0))
+    rest = {name: size(rng, count, centre) for name, centre in (("zeta", 1e-2), ("alpha", 1.0))}
     return {
         "beta": beta,
         "mu": mu,
-        "Omega": size(rng, count, largest, zero=0),
-        "gamma": size(rng, count, largest, zero=0),
+        "Omega": size(rng, count, zero=0),
+        "gamma": size(rng, count, zero=0),
     } | rest
 
 
-def rattle(rng, count, largest, start=False):
-    forces = {name: size(rng, count, largest, signed=True) for name in ("B0", "B1", *(("u0", "v0") * start))}
-    rest = {name: size(rng, count, largest, centre) for name, centre in (("b", 1.0), ("c", 0.1), ("alpha", 0.25))}
-    return forces | rest | {name: size(rng, count, largest, zero=0) for name in ("omega", "k", "I")}
+def rattle(rng, count, start=False):
+    forces = {name: size(rng, count, signed=True) for name in ("B0", "B1", *(("u0", "v0") * start))}
+    rest = {name: size(rng, count, centre) for name, centre in (("b", 1.0), ("c", 0.1), ("alpha", 0.25))}
+    return forces | rest | {name: size(rng, count, zero=0) for name in ("omega", "k", "I")}
 
 
-def moving(rng, count, largest):
-    return rattle(rng, count, largest, start=True)
+def moving(rng, count):
+    return rattle(rng, count, start=True)
 
 
-def tripod(rng, count, largest):
+def tripod(rng, count):
     beta = np.where(rng.random(count) < 0.3, rng.choice([0.0, 1e-8, STEEP], count), rng.uniform(0, 1.57, count))
     usual = {"zeta": 1e-2, "excitation_frequency": 100.0, "L_A": 0.13, "rho": 7850.0, "G": 7.7e10, "d_A": 0.05}
-    return {"beta": beta} | {name: size(rng, count, largest, centre, zero=0) for name, centre in usual.items()}
+    return {"beta": beta} | {name: size(rng, count, centre, zero=0) for name, centre in usual.items()}
 
 
-def planetary(rng, count, largest):
-    masses = {name: size(rng, count, largest, zero=0) for name in ("m_s", "m_p", "I_r", "I_p")}
-    return masses | {name: size(rng, count, largest, 1e8, zero=0.2) for name in ("k_sp", "k_p", "k_su", "k_r")}
+def planetary(rng, count):
+    masses = {name: size(rng, count, zero=0) for name in ("m_s", "m_p", "I_r", "I_p")}
+    return masses | {name: size(rng, count, 1e8, zero=0.2) for name in ("k_sp", "k_p", "k_su", "k_r")}
 
 
 CASES = {
@@ -92,10 +92,10 @@ LONG = ("exact response", "forced")
 SYSTEMS = {moving: "rattle"}
 
 
-def computed(name, largest, count, seed=0):
+def computed(name, count, seed=0):
     """The results of random points, as a dataset."""
     draw, analysis, fixed, options = CASES[name]
-    points = draw(np.random.default_rng(seed), count, largest)
+    points = draw(np.random.default_rng(seed), count)
     system = get_system(SYSTEMS.get(draw, draw.__name__))
     known = get_analysis(analysis).for_system(system)
     lacks = {*known.lacks(system), "branch", "mac"} if analysis == "modes" else set(known.lacks(system))
@@ -135,21 +135,19 @@ def assert_sound(found):
             assert not (np.isinf(values) & (found.outcome < 2)).any(), name
 
 
-@pytest.mark.parametrize("largest", SIZES)
-@pytest.mark.parametrize("name", (*SHORT, "slow flow"))
-def test_some_extreme_points_are_sound(name, largest):
-    found = computed(name, largest, POINTS)
+@pytest.mark.parametrize("name", SHORT)
+def test_some_extreme_points_are_sound(name):
+    found = computed(name, POINTS)
     assert_sound(found)
     assert (found.outcome == 0).any()
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("largest", SIZES)
 @pytest.mark.parametrize("name", CASES)
-def test_many_extreme_points_are_sound(name, largest):
+def test_many_extreme_points_are_sound(name):
     for seed in range(2):
         count = MANY if name in SHORT else POINTS // 4 if name in LONG else POINTS
-        assert_sound(computed(name, largest, count, seed + 1))
+        assert_sound(computed(name, count, seed + 1))
 
 
 @pytest.mark.full

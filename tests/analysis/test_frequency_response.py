@@ -154,6 +154,7 @@ def test_too_few_samples_for_the_harmonics_are_refused():
         run("harmonic_balance", harmonics=5, samples=10)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("method", "size"),
     [

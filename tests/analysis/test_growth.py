@@ -141,6 +141,7 @@ def test_a_kernel_may_be_given_what_it_does_not_use(start, steps):
     np.testing.assert_allclose(ends, [start[0](x) + steps * 2 * x, start[1](x) * (2 * x) ** steps], rtol=1e-15)
 
 
+@pytest.mark.full
 def test_a_field_that_sorts_does_without_the_single_kernel():
     """Sorting cannot be part of a single kernel: the march is slower, but as accurate."""
     plain = flows.linear(np.full(3, 0.2), np.ones(3))

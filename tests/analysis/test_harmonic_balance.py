@@ -88,6 +88,7 @@ def test_error_falls_with_the_harmonics():
     assert (np.diff(errors) < 0).all()
 
 
+@pytest.mark.full
 def test_stability_is_that_of_the_exact_motion():
     """With 31 harmonics the multipliers of the balanced motion are those of the exact attractor."""
     model, basis = model_of(({},), 0.7), hb.Basis(31)
@@ -147,7 +148,7 @@ def test_folds_of_the_branch():
     assert bool(branch.complete[0])
 
 
-@pytest.mark.parametrize(("begin", "end"), [(0.163, 0.05), (0.05, 0.163)])
+@pytest.mark.parametrize(("begin", "end"), full_after(1, [(0.163, 0.05), (0.05, 0.163)], several=True))
 def test_branch_passes_contacts_that_come_and_go(begin, end):
     """With seven harmonics the branch has several folds near .12, where short contacts appear."""
     model, basis = model_of(({},), begin), hb.Basis(7)

@@ -18,6 +18,7 @@ from drivetrain_jax.functions import analyse
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import Component, Flow, System, serves
 from tests.oracles import tripod_reference as oracle
+from tests.sizes import full_after
 
 NINE_DEGREES = math.radians(9)
 FIXED = {"element": "input", "equation": "25", "beta": NINE_DEGREES}
@@ -101,12 +102,16 @@ def test_long_memory_meets_the_target(rtol):
 
 @pytest.mark.parametrize(
     ("solver", "frequency", "rtol", "end"),
-    [
-        ("Dopri8", 20e3, 1e-7, 0.2),
-        pytest.param("Dopri8", 12e3, 1e-5, 0.2, marks=pytest.mark.full),
-        ("Tsit5", 40e3, 1e-5, 0.1),
-        pytest.param("Kvaerno5", 60e3, 1e-4, 0.1, marks=pytest.mark.full),
-    ],
+    full_after(
+        1,
+        [
+            ("Dopri8", 20e3, 1e-7, 0.2),
+            pytest.param("Dopri8", 12e3, 1e-5, 0.2, marks=pytest.mark.full),
+            ("Tsit5", 40e3, 1e-5, 0.1),
+            pytest.param("Kvaerno5", 60e3, 1e-4, 0.1, marks=pytest.mark.full),
+        ],
+        several=True,
+    ),
 )
 def test_errors_of_strobes_of_one_step_are_told(solver, frequency, rtol, end):
     """One step per strobe meets any tolerance of a step, but its errors add up, in some cases beyond the target."""
@@ -148,6 +153,7 @@ def test_outcome_does_not_depend_on_the_outputs():
     assert outcomes == [Outcome.TOLERANCE_NOT_MET] * 2
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("end", [0.75, pytest.param(16.5, marks=pytest.mark.full)])
 def test_phase_does_not_drift(end):
     """Excitation at 3200 Hz and motor at 300 Hz repeat after 32 strobes, and so does the settled motion."""

@@ -59,6 +59,7 @@ def difference(p: dict, name: str, entry: int | None) -> np.ndarray:
     return (high - low) / (2 * step)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", NAMES)
 def test_against_differences(jacobian, name):
     entry = 1 if isinstance(UNEQUAL[name], tuple) else None
@@ -85,6 +86,7 @@ def test_planets_that_differ_slightly():
     np.testing.assert_allclose(ours[alone], ((high - low) / 0.2)[alone], rtol=1e-3, atol=1e-10)
 
 
+@pytest.mark.full
 def test_scaling_of_all_stiffnesses(jacobian, frequencies):
     """f is homogeneous of degree 1/2 in the stiffnesses: sum k df/dk = f/2."""
     total = sum(

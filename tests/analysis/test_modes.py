@@ -222,6 +222,7 @@ def test_fixed_angles_that_do_not_balance_are_not_taken_apart():
     np.testing.assert_allclose(found[1:], exact[1:], rtol=1e-12)
 
 
+@pytest.mark.full
 def test_equal_lists_are_numbers():
     angles = np.radians([[0, 80, 180, 260]])
     listed = run_angles(angles, ["natural_frequency"], k_p=[1e8] * 4).natural_frequency.values
@@ -240,6 +241,7 @@ def test_few_planets(n):
         assert (line[still] < 1e-6).all()
 
 
+@pytest.mark.full
 def test_a_planet_without_bearing_turns_no_frequency():
     """The bidiagonal form has exact zeros, and entries that are only their substitutes."""
     angles = np.linspace(0, 3, 301)[:, None]
@@ -250,6 +252,7 @@ def test_a_planet_without_bearing_turns_no_frequency():
     assert (ds.outcome.values == 0).all()
 
 
+@pytest.mark.full
 def test_coincident_planets_and_no_stiffness_at_all():
     angles = np.array([[0.3, 0.3, 0.3, 2.0], [0.3, 0.3, 0.3, 0.3], [0, 0.5, 2.0, 3.0]])
     found = run_angles(angles, ["natural_frequency"]).natural_frequency.values
@@ -294,6 +297,7 @@ def tracked():
     return dt.run(scene)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("order", full_after(1, [[3, 0, 6, 1, 5, 2, 4], [0, 1, 2, 3, 4, 6, 5]]))
 def test_tracks_follow_neighbours_in_any_order_of_points(order):
     stiffness = np.geomspace(1e8, 1e11, 7)

@@ -116,7 +116,7 @@ def averaged(times, **options):
     return found
 
 
-@pytest.mark.parametrize("reach", [0.0, 1.0])
+@pytest.mark.parametrize("reach", full_after(1, [0.0, 1.0]))
 def test_slow_flow_against_the_polar_equations(reach):
     """The slow flow agrees with (42), (43) by SciPy, from the amplitude and phase of the start."""
     times = np.linspace(0, 120, 31)
@@ -160,6 +160,7 @@ def test_the_slow_flow_settles_at_the_response(sign):
         assert float(found.phase[0]) == pytest.approx(float(steady.phase[0]), abs=1e-9)
 
 
+@pytest.mark.full
 def test_averaging_gives_the_equations_of_multiple_scales():
     """(59), (60) averaged by quadrature over the fast phase are (42), (43), and both methods give the same numbers."""
     model = dt.Rattle(**GEARS).oscillator()
@@ -206,7 +207,7 @@ def test_an_oscillator_far_faster_than_its_drive_is_not_begun():
     assert found.outcome == Outcome.STEP_LIMIT and np.isnan(found.u).all()
 
 
-@pytest.mark.parametrize("omega", [1e-9, 1e-15, 1e-200])
+@pytest.mark.parametrize("omega", full_after(1, [1e-9, 1e-15, 1e-200]))
 def test_a_short_part_of_a_long_period_is_computed(omega):
     """The drive stands still. The least step was a part of its period, and carried the motion over contacts."""
     times = [1.0, 5.0, 10.0, 20.0]

@@ -56,6 +56,7 @@ def test_the_estimate_is_the_error_of_the_section(oscillators):
     assert float(section[2]) < 10 * max(float(strobe[2]), 1e-15)
 
 
+@pytest.mark.full
 def test_chaotic_motion_is_lost_though_its_strobes_are_right():
     """Errors of at most 1e-8 in every strobe grow to the size of the motion for any number of steps."""
     _, (strobe, section) = errors_of(lorenz(2), 24, Steps(48, 12, 48), 20, 200)

@@ -67,6 +67,7 @@ WAVES = {
 }
 
 
+@pytest.mark.full
 def test_a_long_segment_without_mass_has_no_waves():
     assert certify({name: np.array(x) for name, x in WAVES.items()}) >= 10
 

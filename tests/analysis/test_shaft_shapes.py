@@ -271,6 +271,7 @@ def test_shapes_of_weakly_coupled_parts(name):
         assert min(np.abs(found[0, j] - expected).max(), np.abs(found[0, j] + expected).max()) < 1e-12, j
 
 
+@pytest.mark.full
 def test_a_mode_that_turns_without_deflection():
     """Between hinges on rigid supports theta is constant and f = 0 at p^2 = kGA/rhoI; the shape is exactly 0."""
     span = EQUAL | SUPPORTED | {"kGA": (20.0, 50.0), "rhoI": (0.2, 0.01), "k_hinge": 0.0, "k_joint": INF}

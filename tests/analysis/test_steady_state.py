@@ -239,6 +239,7 @@ def test_an_overflow_is_no_steady_state(steady):
     assert np.isnan(found["u_max"]).all() and not found["period_multiple"].any()
 
 
+@pytest.mark.full
 def test_an_unstable_orbit_is_no_steady_state():
     growing = PiecewiseLinearOscillator(damping=-0.1, stiffness=1.0, alpha=1.0, b=0.0, B0=0.0, B1=1.0, omega=2.0)
     orbit = 1.0 / (1 - 2.0**2 - 0.2j)

@@ -38,6 +38,7 @@ def by_hand(omega: float) -> dict:
     return values
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("method", but_full(METHODS, "exact", *list(METHODS)[2:]))
 def test_every_frequency_is_that_of_its_own_amplitude(method):
     """Also outside of scenes, and for a B1 of its own."""

@@ -52,7 +52,7 @@ class InTurns(InSeconds):
 
 
 @pytest.mark.parametrize("damping", [0.1, 40.0])
-@pytest.mark.parametrize("method", full_after(1, ["direct", "diffrax"]))
+@pytest.mark.parametrize("method", full_after(1, full_after(1, ["direct", "diffrax"])))
 def test_both_clocks_have_the_same_multipliers(method, damping):
     def radius(system):
         def solve(speed):

@@ -8,7 +8,7 @@ import pytest
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.systems import get_system
-from tests.sizes import but_full
+from tests.sizes import but_full, full_after
 
 INPUT = {"element": "input"}
 RADIUS = ("spectral_radius", "spectral_radius_error", "verdict")
@@ -87,7 +87,7 @@ LIMITS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", but_full(LIMITS, "lyapunov", "poincare"))
+@pytest.mark.parametrize("name", full_after(1, but_full(LIMITS, "lyapunov", "poincare")))
 def test_a_usual_point_beyond_a_small_limit_is_not_finished(name, monkeypatch):
     module, limit, value, function, system, options = LIMITS[name]
     monkeypatch.setattr(f"drivetrain_jax.analysis.{module}.{limit}", value)

@@ -234,6 +234,7 @@ def test_a_coordinate_may_be_negative(monkeypatch):
     assert other.start([axes[0], -axes[1]])() == pytest.approx(one.start(axes)(), abs=1e-12)
 
 
+@pytest.mark.full
 def test_parts_by_predicted_steps_are_short_enough():
     """Random shafts with the number of parts of an atlas are compared with three times as many parts."""
     lanes, random = 16, np.random.default_rng(1)
@@ -257,6 +258,7 @@ def test_parts_by_predicted_steps_are_short_enough():
         assert np.abs(found - exact).max() < 1e-13 * np.abs(exact).max()
 
 
+@pytest.mark.full
 def test_lines_with_large_truncation_errors_are_computed_again(monkeypatch):
     monkeypatch.setattr(series_module, "_PARTS", 0.04)
     atlas = cardan_atlas(RANGES, 1e-11)
@@ -265,6 +267,7 @@ def test_lines_with_large_truncation_errors_are_computed_again(monkeypatch):
     assert atlas.at(points)["spectral_radius"] == pytest.approx(direct_radius(atlas, points)[0], abs=1e-9)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "wrong", full_after(1, [Series("mu", first=2), Series("Omega", first=1), Series("zeta", first=2)])
 )

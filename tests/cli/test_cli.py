@@ -20,6 +20,7 @@ from drivetrain_jax.cli.commands import _reading
 from drivetrain_jax.cli.progress import progress_line
 from drivetrain_jax.runs.work import Progress
 from drivetrain_jax.systems import get_system
+from tests.sizes import full_after
 
 SCENE = """
 system = "toy"
@@ -552,7 +553,7 @@ _RULES = "from drivetrain_jax.invariants import Declared, Rule\n"
         ("rules", f"{_RULES}X = Declared(Rule('r', (), len))", "bad:X cannot be loaded: TypeError: rules: got Rule"),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("foreign", [False, True])
+@pytest.mark.parametrize("foreign", full_after(3, [False, True]))
 def test_a_figure_or_rule_that_fails_is_named(cli, install, group, code, wanted, foreign):
     install({"bad": code}, **{group: ["toy = bad:X"]})
     cli("run", "scene.toml", "--out", "r.nc", "--quiet")
@@ -651,10 +652,18 @@ def test_a_run_writes_its_file_without_tables(folder, scene):
 
 @pytest.mark.parametrize(
     ("where", "code", "said"),
-    [
-        (">/dev/full", 2, "drivetrain: standard output: No space left on device; allowed is one that can be written\n"),
-        (">&-", 0, ""),
-    ],
+    full_after(
+        1,
+        [
+            (
+                ">/dev/full",
+                2,
+                "drivetrain: standard output: No space left on device; allowed is one that can be written\n",
+            ),
+            (">&-", 0, ""),
+        ],
+        several=True,
+    ),
 )
 def test_an_output_that_takes_nothing(where, code, said):
     command = f"{sys.executable} -m drivetrain_jax.cli list {where}"

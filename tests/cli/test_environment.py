@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+from tests.sizes import full_after
+
 POINT = ["point", "cardan", "floquet", "beta=.4", "Omega=1.2", "zeta=.001", "alpha=1", "mu=1", "gamma=100"]
 SCENE = """
 system = "tripod"
@@ -23,7 +25,7 @@ def drivetrain(*words, **variables):
     return subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ | variables)
 
 
-@pytest.mark.parametrize("name", ["rocm", "rubbish"])
+@pytest.mark.parametrize("name", full_after(1, ["rocm", "rubbish"]))
 def test_a_platform_that_is_not_there_is_one_line(name):
     done = drivetrain(*POINT, JAX_PLATFORMS=name)
     assert done.returncode == 2 and done.stdout == ""
@@ -31,6 +33,7 @@ def test_a_platform_that_is_not_there_is_one_line(name):
     assert done.stderr == f"drivetrain: {said}\n"
 
 
+@pytest.mark.full
 def test_figures_need_no_window_system(tmp_path):
     (tmp_path / "s.toml").write_text(SCENE)
     result, figure = str(tmp_path / "r.nc"), tmp_path / "f.png"

@@ -242,6 +242,7 @@ def test_spaces_and_percent_are_understood(capsys):
     assert options.margin == 0.02
 
 
+@pytest.mark.full
 def test_a_warning_is_one_line_without_code(folder):
     shaft = "length=[300,300] outer_diameter=[0.06,0.06] material=steel k_A=1e6 k_D=1e6 modes=1"
     words = [sys.executable, "-m", "drivetrain_jax.cli", "point", "bicardan", "critical_speeds", *shaft.split()]

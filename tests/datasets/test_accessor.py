@@ -19,6 +19,7 @@ from drivetrain_jax.datasets import figure as figures
 from drivetrain_jax.datasets.resonances import BUILT_IN
 from drivetrain_jax.systems import get_system, system_names
 from drivetrain_jax.view.style import caption
+from tests.atlases import atlas_file
 
 SHAFT = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 CHART = {
@@ -37,7 +38,7 @@ ATLAS = CHART | {
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("results")
     dt.run(CHART, out=folder / "chart.nc")
-    dt.run(ATLAS, out=folder / "atlas.nc")
+    shutil.copy(atlas_file(ATLAS), folder / "atlas.nc")
     return folder
 
 
@@ -123,6 +124,7 @@ def test_the_caption_of_a_part_of_an_atlas(tmp_path):
     assert captions(dt.plot(part.drivetrain.named().assign(part.data_vars))).count(r"\zeta") == 1
 
 
+@pytest.mark.full
 def test_what_plot_takes(folder, chart):
     for result in (chart, folder / "chart.nc", str(folder / "chart.nc"), [chart], [folder / "chart.nc"]):
         assert isinstance(dt.plot(result), matplotlib.figure.Figure)
@@ -209,6 +211,7 @@ def test_a_figure_shows_itself(chart):
     assert png.startswith(b"\x89PNG") and size["width"] == 700
 
 
+@pytest.mark.full
 def test_a_figure_of_a_stored_result_needs_no_jax(folder):
     """Its predicted resonances neither; jax takes longer to import than the figure to draw."""
     check = [

@@ -19,6 +19,7 @@ from drivetrain_jax.atlas.panels import position
 from drivetrain_jax.datasets import lazy
 from drivetrain_jax.runs import rounds
 from drivetrain_jax.runs.atlas_file import StoredAtlas
+from tests.atlases import atlas_file
 from tests.sizes import but_full
 
 ATLAS = {
@@ -31,10 +32,8 @@ GRID = {"beta": 300, "Omega": (1.2, 1.8, 400)}
 
 
 @pytest.fixture(scope="module")
-def file(tmp_path_factory):
-    path = tmp_path_factory.mktemp("atlas") / "atlas.nc"
-    dt.run(ATLAS, out=path)
-    return path
+def file():
+    return atlas_file(ATLAS)
 
 
 @pytest.fixture(scope="module")
@@ -149,6 +148,7 @@ def deep(tmp_path_factory):
     return path
 
 
+@pytest.mark.full
 def test_chunks_agree_along_an_axis_that_predictions_depend_on(deep):
     found = opened(deep, {"beta": 200, "Omega": 200, "mu": 150}, chunks={})
     assert found.drivetrain.resonances().dims == ("mu", "resonance")
@@ -303,6 +303,7 @@ def test_other_readers_see_the_panels(file):
         np.testing.assert_array_equal(found["coefficients"].values, coefficients)
 
 
+@pytest.mark.full
 def test_gaps_are_solved_or_have_no_value(monkeypatch, tmp_path):
     monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
     path, grid = tmp_path / "gaps.nc", {"beta": [0.1, 0.3], "Omega": [1.2, 1.3, 1.9]}

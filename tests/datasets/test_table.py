@@ -46,6 +46,7 @@ def test_complex_numbers_have_two_columns(tmp_path):
         np.testing.assert_array_equal(values, chart.floquet_multiplier[:, k])
 
 
+@pytest.mark.full
 def test_samples_of_a_history_are_rows(tmp_path):
     shaft = dt.Tripod(element="input", beta=0.157, zeta=0.0016)
     over = {"zeta": [0.0016, 0.01]}

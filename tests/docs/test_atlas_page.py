@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
+
 from benchmarks import atlas_attack
 from benchmarks.page_atlas import PAGE, label, section, written
+
+pytestmark = pytest.mark.docs
 
 ROW = {
     "case": "four", "beta": "0..1.3", "Omega": "0.2..2.5", "zeta": "0.001", "alpha": "0.1..20", "mu": "0.2..20",

@@ -11,6 +11,8 @@ import pytest
 
 from drivetrain_jax.cli import main
 
+pytestmark = pytest.mark.docs
+
 PAGE = Path(__file__).parents[2] / "docs" / "engineering.md"
 NUMBER = re.compile(r"(?<![\w.])-?\d+\.?\d*(?:e[+-]?\d+)?(?![\w.])")
 
@@ -32,7 +34,6 @@ def commands(text: str) -> list[tuple[str, str]]:
     ]
 
 
-@pytest.mark.full
 def test_every_command_gives_the_answer_of_the_page(tmp_path, monkeypatch, capsys):
     text = PAGE.read_text()
     for name, content in re.findall(r"^```\w+\n# (\w+\.\w+)\n(.*?)^```", text, re.M | re.S):

@@ -15,6 +15,8 @@ import pytest
 
 from drivetrain_jax.store.consolidate import open_result
 
+pytestmark = pytest.mark.docs
+
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "extending.md").read_text()
 OFFLINE = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--target"]
@@ -54,7 +56,6 @@ def executed(text: str, folder: Path) -> tuple[Path, str, Callable[..., str]]:
     return project, answers + python(*test[1:]), python
 
 
-@pytest.mark.full
 def test_the_page_is_true(tmp_path):
     project, answers, python = executed(SYSTEM, tmp_path)
     assert "angle of both joints" in answers
@@ -73,7 +74,6 @@ def test_the_page_is_true(tmp_path):
     assert (project / "chart.png").stat().st_size > 20_000
 
 
-@pytest.mark.full
 def test_a_new_analysis_serves_the_systems_of_the_package(tmp_path):
     project, answers, _ = executed(ANALYSIS, tmp_path)
     assert "Analysis settling: settling time" in answers and "remaining share" in answers

@@ -12,6 +12,8 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "docs"))
 import gallery  # noqa: E402
 
+pytestmark = pytest.mark.docs
+
 SCENE = """# A remark.
 title = "{title}"
 system = "tripod"

@@ -10,6 +10,8 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 import generated
 
+pytestmark = pytest.mark.docs
+
 
 def test_a_page_lists_what_its_system_offers():
     cardan, tripod = generated.analyses("cardan"), generated.analyses("tripod")

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.docs
+
 ROOT = Path(__file__).parents[2]
 TITLE = "## Every equation, figure, table and conclusion"
 # Equations without those with a letter, figures, tables; conclusions and whatever else the paper states.

@@ -12,6 +12,8 @@ import pytest
 from drivetrain_jax.cli.arguments import parser
 from drivetrain_jax.runs.scene import load_scene
 
+pytestmark = pytest.mark.docs
+
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs" / "theory").glob("*.md"))]
 COMMANDS = [

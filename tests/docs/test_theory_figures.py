@@ -15,6 +15,8 @@ from scipy.optimize import newton
 from drivetrain_jax.resonances.cardan import natural_frequencies
 from drivetrain_jax.systems import get_system, tripod
 
+pytestmark = pytest.mark.docs
+
 ROOT = Path(__file__).parents[2]
 THEORY = ROOT / "docs" / "theory"
 BASE = get_system("cardan").presets["base"]

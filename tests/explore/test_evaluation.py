@@ -58,7 +58,7 @@ def agree(ours, theirs):
     return int(((verdict != UNDECIDED) & (theirs[2] == UNDECIDED)).sum())
 
 
-@pytest.mark.parametrize("name", full_after(2, ["one", "two", "mathieu", "three", "four"]))
+@pytest.mark.parametrize("name", full_after(1, full_after(2, ["one", "two", "mathieu", "three", "four"])))
 def test_points_have_the_values_and_verdicts_of_python(atlases, pages, tmp_path, name):
     points = chosen(atlases(name), 500, 100)
     lost = agree(columns(atlases(name), points), by_node(pages(name), points, tmp_path))
@@ -135,6 +135,7 @@ def _lower_half(coefficients):
     return np.einsum("ij,ajm->aim", matrix, coefficients)
 
 
+@pytest.mark.full
 def test_the_nearest_changes_are_those_of_query(atlases, pages):
     atlas, point = atlases("two"), {"beta": 0.6, "Omega": 1.2}
     told = node(pages("two"), "nearest", *point.values())

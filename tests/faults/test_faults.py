@@ -18,7 +18,7 @@ pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="fa
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
     found, modules = list(sys.path), set(sys.modules)
-    yield Bench(tmp_path_factory.mktemp("faults"), points=40_000, seed=3)
+    yield Bench(tmp_path_factory.mktemp("faults"), points=8_000, seed=3)
     # The system that it installs is not one of the package for other tests.
     sys.path[:] = found
     for name in {"light"} & (set(sys.modules) - modules):

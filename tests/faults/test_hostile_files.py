@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import socket
-import time
 from pathlib import Path
 
 import h5py
@@ -20,6 +19,7 @@ from drivetrain_jax.runs.run import run_to_file
 from drivetrain_jax.runs.status import status
 from drivetrain_jax.store import checksums, gate
 from drivetrain_jax.store.consolidate import map_variable, read_variable
+from tests.sizes import full_after
 
 pytestmark = pytest.mark.usefixtures("toys")
 
@@ -75,17 +75,19 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize("kind", HOSTILE)
-def test_a_hostile_file_is_refused_by_every_reader(path, capsys, kind):
+@pytest.mark.parametrize("kind", full_after(4, HOSTILE))
+def test_a_hostile_file_is_refused(path, kind):
     replaced(path, HOSTILE[kind])
-    begin = time.monotonic()
-    for words in (["verify", "r.nc"], ["plot", "r.nc", "--out", "f.png"], ["run", "scene.toml", "--out", "r.nc"]):
-        assert main(words) == 2
-        said = capsys.readouterr().err
-        assert "not a readable netCDF4/HDF5 file" in said and len(said.splitlines()) == 1, said
     with pytest.raises(InputError, match="not a readable"):
         dt.open_result(path)
-    assert time.monotonic() - begin < 20
+
+
+@pytest.mark.parametrize("words", ["verify r.nc", "plot r.nc --out f.png", "run scene.toml --out r.nc"])
+def test_every_reader_refuses_a_hostile_file(path, capsys, words):
+    replaced(path, HOSTILE["virtual"])
+    assert main(words.split()) == 2
+    said = capsys.readouterr().err
+    assert "not a readable netCDF4/HDF5 file" in said and len(said.splitlines()) == 1, said
 
 
 def with_rank(values):
@@ -106,7 +108,7 @@ UNFIT = {
 }
 
 
-@pytest.mark.parametrize("kind", UNFIT)
+@pytest.mark.parametrize("kind", full_after(4, UNFIT))
 def test_sealed_content_of_no_result_is_one_line(path, capsys, kind):
     replaced(path, UNFIT[kind])
     with h5py.File(path, "r+") as file:
@@ -180,7 +182,7 @@ def test_a_selection_that_xarray_has_written_is_opened(path):
     assert checksums.ATTRIBUTE in part.attrs and dt.open_result("part.nc").identical(part)
 
 
-@pytest.mark.parametrize("kind", ["pipe", "device"])
+@pytest.mark.parametrize("kind", full_after(1, ["pipe", "device"]))
 @pytest.mark.parametrize(
     "words",
     [

@@ -34,6 +34,7 @@ def counts(line):
     return {key: int(value) for key, _, value in (word.partition("=") for word in line.split()[1:])}
 
 
+@pytest.mark.full
 def test_an_io_error_inside_hdf5_is_one_line_and_costs_nothing(tmp_path):
     environment = os.environ | {"LD_PRELOAD": str(library(tmp_path))}
     command = [sys.executable, str(HERE / "io_errors.py"), str(tmp_path), json.dumps(CASES)]

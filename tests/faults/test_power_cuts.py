@@ -18,6 +18,7 @@ from drivetrain_jax.runs.run import Interrupted, run_to_file
 from drivetrain_jax.runs.status import status
 from drivetrain_jax.store import shards, zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
+from tests.sizes import full_after
 
 pytest.importorskip("zarr")
 pytestmark = pytest.mark.usefixtures("toys")
@@ -101,7 +102,7 @@ def empty(folder, pattern):
         path.write_bytes(b"")
 
 
-@pytest.mark.parametrize("lost", ["*", "shards/c/*", "a/c/*", "zarr.json", "value/**/*"])
+@pytest.mark.parametrize("lost", full_after(2, ["*", "shards/c/*", "a/c/*", "zarr.json", "value/**/*"]))
 def test_a_run_survives_a_power_cut_that_empties_its_store(tmp_path, lost):
     path, pool = tmp_path / "r.zarr", threads(1, "chunk")
     with pytest.raises(Interrupted):
@@ -117,7 +118,7 @@ def test_a_run_survives_a_power_cut_that_empties_its_store(tmp_path, lost):
     assert status(LARGE, path).state == "complete" and zarr_store.damage(path) == ""
 
 
-@pytest.mark.parametrize("lost", ["*", "zarr.json", "value/c/**/*", "outcome/c/**/*", "a/c/*"])
+@pytest.mark.parametrize("lost", full_after(2, ["*", "zarr.json", "value/c/**/*", "outcome/c/**/*", "a/c/*"]))
 @pytest.mark.parametrize("gone", [True, False])
 def test_a_finished_store_that_lost_files_is_not_believed_and_replaced(tmp_path, lost, gone):
     path = tmp_path / "r.zarr"

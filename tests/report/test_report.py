@@ -64,6 +64,7 @@ def test_one_page_joins_results_and_needs_nothing_else(files, tmp_path):
     assert f"Order 2 (joints) meets modes at {first / 2:.6g}, " in text
 
 
+@pytest.mark.full
 def test_a_report_is_the_same_each_time(files):
     assert report(files) == report(files)
 
@@ -141,6 +142,7 @@ def test_a_unit_that_nothing_measures_is_refused(truck, files, tmp_path, capsys)
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.full
 def test_the_report_says_what_stable_means(truck):
     point = dt.point("cardan", "floquet", speed="1425 rpm", **TRUCK)
     text = " ".join(Page(report(truck[:1])).words)
@@ -154,6 +156,7 @@ def test_the_report_says_what_stable_means(truck):
     assert "it halves in " in said and " 1/s, by a factor 0.99" in said
 
 
+@pytest.mark.full
 def test_the_report_compares_the_forced_motion_with_a_limit(truck):
     amplitude = np.rad2deg(dt.open_result(truck[1]).amplitude.max("shaft").values)
     assert amplitude[2] < 2 < amplitude[1]

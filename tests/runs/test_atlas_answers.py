@@ -22,16 +22,21 @@ from drivetrain_jax.runs.atlas_chart import chart
 from drivetrain_jax.runs.atlas_file import StoredAtlas
 from drivetrain_jax.systems import get_system
 from drivetrain_jax.systems.cardan_units import PHYSICAL
+from tests.atlases import atlas_file, stored_atlas
 from tests.sizes import full_after
 
 S21 = (0.1063331213, 1.4159881603)
 CARDAN = get_system("cardan")
 
 
+def stored(scene: dict) -> xr.Dataset:
+    return dt.open_result(atlas_file(scene))
+
+
 @cache
 def panels(beta: tuple, omega: tuple, rtol: float = 1e-9, zeta: float = 0.001, gamma: float = 100.0) -> xr.Dataset:
     axes = {"beta": beta, "Omega": omega}
-    return dt.run(
+    return stored(
         {
             "system": "cardan",
             "analysis": "atlas",
@@ -47,7 +52,7 @@ def test_an_atlas_answers_with_multipliers_as_well():
     axes = {"beta": {"start": 0.2, "stop": 0.4}, "Omega": {"start": 1.3, "stop": 1.5}}
     fixed = {"zeta": 0.01, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
     scene = {"system": "cardan", "analysis": "atlas", "axes": axes, "fixed": fixed, "outputs": ["floquet_multiplier"]}
-    reply = atlas_answers.query(dt.open_atlas(dt.run(scene)), {"beta": 0.3, "Omega": 1.416})
+    reply = atlas_answers.query(stored_atlas(scene), {"beta": 0.3, "Omega": 1.416})
     expected = dt.point("cardan", "floquet", beta=0.3, Omega=1.416, outputs="floquet_multiplier", **fixed)
     found = json.loads(reply.to_json())["values"]["floquet_multiplier"]
     np.testing.assert_allclose([z["real"] + 1j * z["imag"] for z in found], expected.floquet_multiplier, rtol=1e-8)
@@ -115,7 +120,7 @@ def test_tiles_lie_along_the_longest_axes_of_a_chart(monkeypatch, axes):
     table = {name: dict(zip(("start", "stop"), ranges[name], strict=True)) for name in axes}
     fixed = {"zeta": 0.001, "alpha": 1.0, "gamma": 100.0}
     scene = {"system": "cardan", "analysis": "atlas", "axes": table, "fixed": fixed, "options": {"rtol": 1e-8}}
-    atlas, cut = dt.open_atlas(dt.run(scene)), []
+    atlas, cut = stored_atlas(scene), []
 
     def counted(*given, **more):
         for tile in tiles(*given, **more):
@@ -134,7 +139,7 @@ def test_tiles_lie_along_the_longest_axes_of_a_chart(monkeypatch, axes):
         assert (alone.verdict == ours.verdict).all() and (ours.spectral_radius_error < 1e-7).all()
 
 
-@pytest.mark.parametrize("number", [np.float32, np.float64, np.array])
+@pytest.mark.parametrize("number", full_after(1, [np.float32, np.float64, np.array]))
 def test_numbers_of_numpy_are_accepted(number):
     atlas, speeds = atlas_of((-0.2, 0.3), (1.3, 1.5)), (1.3125, 1.5)
     found = atlas_answers.query(atlas, {"beta": number(0.25), "Omega": number(1.375)}).data
@@ -185,7 +190,7 @@ def test_every_slice_of_a_chart_has_its_own_curve():
     axes = {"beta": (0.05, 0.3), "alpha": (0.5, 4.0), "Omega": (1.35, 1.48)}
     scene = {"axes": {name: {"start": low, "stop": high} for name, (low, high) in axes.items()}}
     fixed = {"zeta": 0.001, "mu": 1.0, "gamma": 100.0}
-    source = dt.run({"system": "cardan", "analysis": "atlas", "fixed": fixed, **scene})
+    source = stored({"system": "cardan", "analysis": "atlas", "fixed": fixed, **scene})
     drawn = chart(source, {}, 20)
     assert drawn["boundary_beta"].dims == ("alpha", "boundary") and "tip" not in drawn.coords
     for alpha in drawn["alpha"].values:
@@ -241,6 +246,7 @@ def test_the_nearest_change_next_to_an_undecided_range():
     assert abs(below["value"] - exact.data["nearest"]["Omega"]["below"]["value"]) < below["error"] < 1e-3
 
 
+@pytest.mark.full
 def test_no_change_is_stated_with_undecided_ranges_as_exception():
     atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
     nearest = design.Nearest("Omega", 1.0, None, None, ((0.9, 1.1),))
@@ -248,6 +254,7 @@ def test_no_change_is_stated_with_undecided_ranges_as_exception():
     assert atlas_answers._reach(atlas, replace(nearest, undecided=())) == "none from 0.3 to 2"
 
 
+@pytest.mark.full
 def test_very_little_damping_is_not_zero_damping():
     """Without damping S21 reaches down to the angle 0, with very little damping only down to .0001."""
     atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
@@ -286,7 +293,8 @@ def test_stable_intervals_away_from_the_safe_end_are_listed():
 
 
 @pytest.mark.parametrize(
-    ("speeds", "kind", "value"), [((1.3, 1.5), "crossing", S21[0]), ((1.415, 1.417), "undecided", 0.1062824374)]
+    ("speeds", "kind", "value"),
+    full_after(1, [((1.3, 1.5), "crossing", S21[0]), ((1.415, 1.417), "undecided", 0.1062824374)], several=True),
 )
 def test_an_answer_names_the_kinds_of_its_ends(speeds, kind, value):
     """On a loose atlas the tip of S21 is undecided from .10628 to .10640, in a narrow range of speeds to .11255."""
@@ -309,18 +317,19 @@ def test_a_slowly_resolved_boundary_function_is_not_taken_for_rounding():
     """Of this shaft five patches hardly resolve more than three: all speeds were undecided."""
     given = {"J1": 1.2, "J2": 0.35, "k1": 3e4, "k2": 2.5e4, "c1": 2.0, "c2": 0.3, "angle": "15 deg"}
     speed = {"start": "100 rpm", "stop": "4500 rpm"}
-    atlas = dt.open_atlas(dt.run({"system": "cardan", "analysis": "atlas", "axes": {"speed": speed}, "fixed": given}))
+    atlas = stored_atlas({"system": "cardan", "analysis": "atlas", "axes": {"speed": speed}, "fixed": given})
     found = atlas_answers.speed_windows(atlas, {}).data
     ends = [end["value"] for window in found["windows"] for end in window["ends"]]
     assert ends[1:-1] == pytest.approx([0.84714, 0.84976, 1.41307, 1.42805, 1.98566, 1.99992], abs=1e-5)
     assert not found["undecided"]
 
 
+@pytest.mark.full
 def test_a_question_may_repeat_what_follows_from_the_data_of_the_atlas():
     """``zeta`` follows from c1, as ``alpha`` does: to replace c1 by it left nothing for ``alpha``."""
     given = {"J1": 2.0, "J2": 0.5, "k1": 6e4, "k2": 4e4, "c1": 0.3464, "c2": 0.1414, "angle": "12 deg"}
     speed = {"start": "1400 rpm", "stop": "1450 rpm"}
-    atlas = dt.open_atlas(dt.run({"system": "cardan", "analysis": "atlas", "axes": {"speed": speed}, "fixed": given}))
+    atlas = stored_atlas({"system": "cardan", "analysis": "atlas", "axes": {"speed": speed}, "fixed": given})
     plain = atlas_answers.query(atlas, {"speed": 1425.0}).data
     for repeated in ({"zeta": 0.0005}, {"zeta": 0.0005, "alpha": 0.4082, "mu": 2 / 3, "gamma": 0.25, "beta": "12 deg"}):
         assert atlas_answers.query(atlas, {"speed": 1425.0, **repeated}).data == plain

@@ -24,8 +24,7 @@ from drivetrain_jax.runs.atlas_chart import chart
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.run import Incomplete, Interrupted, run_to_file
 from drivetrain_jax.runs.scene import load_scene
-from drivetrain_jax.store.consolidate import write_result
-from tests.labels import labelled
+from tests.atlases import atlas_file
 from tests.sizes import full_after
 
 BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
@@ -82,7 +81,7 @@ def direct():
 
 @pytest.fixture(scope="module")
 def stored():
-    return dt.run(ATLAS)
+    return dt.open_result(atlas_file(ATLAS))
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +96,7 @@ def test_a_chart_through_an_atlas(direct):
     assert found.sizes["mu"] == 1 and (found["outcome"] <= Outcome.TOLERANCE_NOT_MET).all()
 
 
+@pytest.mark.full
 def test_points_and_multipliers_through_an_atlas():
     random = np.random.default_rng(0)
     points = {"Omega": random.uniform(*OMEGA, 50).tolist(), "beta": random.uniform(*BETA, 50).tolist()}
@@ -168,7 +168,10 @@ def interrupted_run(scene, out, reports):
         run_to_file(scene, out, report=stop_after(reports))
 
 
-@pytest.mark.parametrize(("scene", "chunks"), [(ATLAS, 1), (AT_ONE_SPEED, 1), (AT_ONE_SPEED, 3), (AT_ONE_SPEED, 6)])
+@pytest.mark.parametrize(
+    ("scene", "chunks"),
+    full_after(2, [(ATLAS, 1), (AT_ONE_SPEED, 1), (AT_ONE_SPEED, 3), (AT_ONE_SPEED, 6)], several=True),
+)
 def test_an_interrupted_atlas_is_resumed_with_the_same_bits(tmp_path, scene, chunks):
     """The interrupt is in the only round of solves, or in the first or a later round of an atlas with solved nodes."""
     out, whole = tmp_path / "a.nc", dt.run(scene)
@@ -214,6 +217,7 @@ def test_the_solves_of_an_atlas_run_on_workers(stored, monkeypatch):
     assert_same_arrays(dt.run(ATLAS, workers=2), stored)
 
 
+@pytest.mark.full
 def test_the_function_of_the_parameters(atlas, direct):
     assert atlas.parameters == ("beta", "Omega") and atlas.ranges == {"beta": BETA, "Omega": OMEGA}
     omega, beta = direct["Omega"].values, direct["beta"].values
@@ -301,6 +305,7 @@ def test_a_system_without_an_atlas_is_refused_before_anything_is_written(tmp_pat
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.full
 def test_gaps_of_a_stored_atlas_are_solved(monkeypatch):
     monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
     atlas = dt.open_atlas(dt.run(ATLAS))
@@ -360,6 +365,7 @@ def test_nearest_boundaries_of_a_point(atlas):
     assert f"Omega = {omega:.10g}" in str(reply) and "verdict                  stable (0)" in str(reply)
 
 
+@pytest.mark.full
 def test_the_same_point_in_physical_units(atlas):
     stiffness, inertia = 1000.0, 2.0
     damping = 2 * 0.001 * (stiffness * inertia) ** 0.5
@@ -399,6 +405,7 @@ def test_the_parameter_of_the_answer_is_not_given(atlas):
         atlas_answers.widest_angle(atlas, {**shaft, "speed": (250.0, 260.0), "angle": 20.0})
 
 
+@pytest.mark.full
 def test_a_range_of_speeds_restricts_the_windows(atlas):
     (window,) = atlas_answers.speed_windows(atlas, {"beta": "0.31 rad", "Omega": (1.1, 1.2)}).data["windows"]
     assert window["safe"] == [1.1, 1.2] and [end["kind"] for end in window["ends"]] == ["range", "range"]
@@ -466,6 +473,7 @@ def test_least_damping_of_a_range_of_speeds():
     assert largest(0.999 * data["value"]) > 1 > largest(1.001 * data["value"])
 
 
+@pytest.mark.full
 def test_a_chart_of_a_stored_atlas(stored):
     found = chart(stored, {"Omega": (1.3, 1.5)}, 60)
     assert found["verdict"].shape == (60, 60) and found["Omega"].values[[0, -1]].tolist() == [1.3, 1.5]
@@ -515,11 +523,9 @@ def test_too_many_parameters_for_an_atlas():
         dt.run({**floquet("atlas", axes), "fixed": {"gamma": 100.0}})
 
 
-@pytest.fixture(scope="module")
-def file(stored, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("atlas")
-    write_result(labelled(stored), folder / "atlas.nc", folder / "tmp")
-    return folder / "atlas.nc"
+@pytest.fixture
+def file(tmp_path):
+    return shutil.copy(atlas_file(ATLAS), tmp_path / "atlas.nc")
 
 
 def answer(capsys, *arguments):
@@ -545,6 +551,7 @@ def test_questions_on_the_command_line(file, capsys):
     assert code == 2 and "least-damping" in err and err.count("\n") == 1
 
 
+@pytest.mark.full
 def test_a_zoom_on_the_command_line(file, capsys):
     figure = file.with_name("zoom.png")
     code, _, err = answer(
@@ -585,6 +592,7 @@ def test_blocks_of_a_grid_cover_it_once(lengths, rows):
     assert {size[-2] for size in sizes} <= {rows, lengths[-2] % rows}
 
 
+@pytest.mark.full
 def test_the_kernel_of_single_cells_compiles_during_the_solves(monkeypatch):
     """A large chart compiles this kernel while the solves compile, and no other one afterwards."""
     from drivetrain_jax.atlas import stability

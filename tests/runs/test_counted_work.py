@@ -95,6 +95,7 @@ def operations(jaxpr: Any) -> int:
     return len(jaxpr.eqns) + sum(operations(body) for body in bodies if hasattr(body, "eqns"))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("system", ["cardan", "bicardan", "rattle"])
 def test_operations(system):
     engine = resolve(load_scene(SCENES[system]))
@@ -109,6 +110,7 @@ def test_steps_of_the_chart():
     assert not complaint("predicted steps cardan", int(sum(group.efforts.sum() * group.chunk for group in plan.groups)))
 
 
+@pytest.mark.full
 def test_solves_of_an_atlas():
     scene = SCENES["cardan"] | {"options": {"method": "atlas", "rtol": 1e-10}}
     scene["fixed"] = scene["fixed"] | {"mu": 20.0}

@@ -344,6 +344,7 @@ def test_wrong_executor_is_one_clear_line(options, message):
         list(make_executor(**options).run(_engine(), [0]))
 
 
+@pytest.mark.full
 def test_a_script_without_guard_is_told_so(tmp_path):
     """Each process imports the script, which would start the run again."""
     script = tmp_path / "script.py"

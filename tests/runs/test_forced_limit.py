@@ -12,6 +12,7 @@ import drivetrain_jax as dt
 from drivetrain_jax.cli import main
 from drivetrain_jax.runs import atlas_answers
 from drivetrain_jax.runs.forced_limit import Limit
+from tests.atlases import stored_atlas
 
 DATA = {"J1": 2.0, "J2": 0.5, "k1": 6e4, "k2": 4e4, "c1": 0.3464, "c2": 0.1414, "angle": "12 deg"}
 WORDS = [f"{name}={value}" for name, value in DATA.items()]
@@ -45,6 +46,7 @@ def test_a_curve_below_the_limit_is_within_it():
     assert TWO.along(lambda r: np.full((r.size, 2), 1.0), 1.0, 2.0, np.empty(0)).within == ()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("limit", "within"), [("2 deg", True), ("1.5 deg", False), (0.03, True)])
 def test_a_point_compares_its_forced_motion_with_a_limit(limit, within):
     found = dt.point("cardan", "floquet", **DATA, speed=2000.0, amplitude=limit)
@@ -91,7 +93,7 @@ def test_limits_that_mean_nothing_are_refused(capsys):
 @pytest.mark.full
 def test_windows_of_an_atlas_say_where_the_amplitude_is_within_the_limit():
     axes = {"speed": {"start": "1900 rpm", "stop": "2100 rpm"}}
-    atlas = dt.open_atlas(dt.run({"system": "cardan", "analysis": "atlas", "fixed": DATA, "axes": axes}))
+    atlas = stored_atlas({"system": "cardan", "analysis": "atlas", "fixed": DATA, "axes": axes})
     reply = atlas_answers.speed_windows(atlas, {}, amplitude="1.6 deg")
     (found,) = reply.data["forced"]
     assert "above the limit of 1.6 deg; within the limit from" in str(reply)

@@ -71,6 +71,7 @@ def test_lines_are_pending_as_a_whole(tmp_path, order):
     assert pending.any() and not pending.all() and (pending.all(axis=1) == pending.any(axis=1)).all()
 
 
+@pytest.mark.full
 def test_an_unfinished_chart_is_drawn(tmp_path, capsys):
     base = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
     axes = {"beta": {"start": 0.1, "stop": 1.2, "num": 20}, "Omega": {"start": 0.5, "stop": 1.5, "num": 20}}

@@ -198,6 +198,7 @@ def test_a_stepped_steel_shaft():
     assert euler.kGA == () and euler.rhoI == () and euler.EI == pytest.approx(shaft.EI)
 
 
+@pytest.mark.full
 def test_one_diameter_may_vary():
     scene = {"system": "bicardan", "analysis": "critical_speeds", "axes": {"outer_diameter[1]": ["90 mm", "100 mm"]}}
     found = dt.run({**scene, "fixed": SHAFT, "options": {"modes": 1}, "outputs": ["critical_speed"]})

@@ -45,6 +45,7 @@ def test_readable():
     ]
 
 
+@pytest.mark.full
 def test_errors_have_three_digits():
     found = dt.point("planetary", "modes", outputs=["natural_frequency", "natural_frequency_error"])
     first = repr(found).splitlines()[3].split()
@@ -84,6 +85,7 @@ def test_one_output_may_be_a_word():
         dt.point("toy", "toy", a=6.0, outputs="all")
 
 
+@pytest.mark.full
 def test_lists_are_printed_side_by_side():
     result = dt.point("planetary", "modes", outputs=["natural_frequency", "mode_type"])
     lines = repr(result).splitlines()
@@ -173,6 +175,7 @@ def test_a_function_has_no_value_at_one_point():
         dt.point("cardan", "atlas", beta=0.3)
 
 
+@pytest.mark.full
 def test_a_matrix_is_printed_with_its_rows_and_columns():
     shaft = {"length": [0.07, 0.59, 0.25], "EI": [64427.0, 22157.0, 8350.0], "rhoA": [15.3, 2.81, 5.51]}
     shape = dt.point("bicardan", "critical_speeds", **shaft, k_A=85e6, k_D=2e7, modes=2, outputs=["mode_shape"])

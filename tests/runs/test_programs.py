@@ -37,7 +37,8 @@ print(programs.compiled(called, kinds, {}, "name")(jnp.zeros(3)))
 
 
 def lines(script, folder, *arguments):
-    environment = os.environ | {"DRIVETRAIN_JAX_CACHE": str(folder)}
+    environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    environment["DRIVETRAIN_JAX_CACHE"] = str(folder)
     done = subprocess.run(
         [sys.executable, "-c", script, *arguments], env=environment, capture_output=True, text=True, check=True
     )
@@ -48,6 +49,7 @@ def stored(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("programs/*"))
 
 
+@pytest.mark.full
 def test_a_later_process_traces_nothing_and_gets_the_same_bits(tmp_path):
     first = lines(POINT, tmp_path)
     assert first[-1] == "1" and len(stored(tmp_path)) == 1
@@ -100,6 +102,7 @@ print(dt.sweep(lambda point: {"y": factor * point["a"]}, {"a": 1.0}, over={"a": 
 """
 
 
+@pytest.mark.full
 def test_functions_of_a_user_are_not_stored(tmp_path):
     """Two processes sweep functions of one name and one file."""
     assert lines(FUNCTION, tmp_path, "2") == ["[2.0,", "4.0]"] and stored(tmp_path) == []

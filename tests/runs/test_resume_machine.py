@@ -23,6 +23,7 @@ from drivetrain_jax.runs.run import Interrupted, run_to_file
 from drivetrain_jax.runs.status import status
 from drivetrain_jax.store import shards, zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
+from tests.sizes import full_after
 
 COUNTS, NUMBERS = (8, 24, 40), (3, 4)
 
@@ -187,18 +188,15 @@ def intervals(monkeypatch):
 HOW = {"deadline": None, "suppress_health_check": list(HealthCheck), "database": None, "phases": (Phase.generate,)}
 
 
-MACHINES = pytest.mark.parametrize("machine", [ResumeMachine, StoreMachine])
-
-
-@MACHINES
+@pytest.mark.parametrize("machine", full_after(1, [ResumeMachine, StoreMachine]))
 def test_no_order_of_events_gives_a_wrong_value(machine):
     pytest.importorskip("zarr")
     short = settings(max_examples=6, stateful_step_count=10, derandomize=True, **HOW)
     run_state_machine_as_test(machine, settings=short)
 
 
-@MACHINES
 @pytest.mark.full
+@pytest.mark.parametrize("machine", [ResumeMachine, StoreMachine])
 def test_no_long_order_of_events_gives_a_wrong_value(machine):
     pytest.importorskip("zarr")
     run_state_machine_as_test(machine, settings=settings(max_examples=40, stateful_step_count=20, **HOW))

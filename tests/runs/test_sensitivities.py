@@ -11,6 +11,7 @@ from scipy.optimize import brentq
 import drivetrain_jax as dt
 from drivetrain_jax.cli import main
 from drivetrain_jax.runs import atlas_answers
+from tests.atlases import stored_atlas
 
 DATA = {"J1": 2.0, "J2": 0.5, "k1": 6e4, "k2": 4e4, "c1": 0.3464, "c2": 0.1414, "angle": 12.0}
 SCENE = {"system": "cardan", "analysis": "atlas", "fixed": DATA}
@@ -18,7 +19,7 @@ SCENE = {"system": "cardan", "analysis": "atlas", "fixed": DATA}
 
 @pytest.fixture(scope="module")
 def atlas():
-    return dt.open_atlas(dt.run(SCENE | {"axes": {"speed": {"start": "3080 rpm", "stop": "3200 rpm"}}}))
+    return stored_atlas(SCENE | {"axes": {"speed": {"start": "3080 rpm", "stop": "3200 rpm"}}})
 
 
 def radius(data: dict) -> float:
@@ -61,7 +62,7 @@ def test_sensitivities_of_the_radius_are_sorted_and_physical(atlas):
 def test_without_physical_data_the_parameters_are_sorted():
     fixed = {"beta": 0.3, "zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
     scene = {"system": "cardan", "analysis": "atlas", "fixed": fixed, "axes": {"Omega": {"start": 1.4, "stop": 1.43}}}
-    found = atlas_answers.query(dt.open_atlas(dt.run(scene)), {"Omega": 1.416}).data
+    found = atlas_answers.query(stored_atlas(scene), {"Omega": 1.416}).data
     assert {each["name"]: each["slope"] for each in found["sensitivities"]} == pytest.approx(
         found["gradient"], rel=1e-9
     )
@@ -81,6 +82,7 @@ def test_a_verdict_at_a_point_says_what_it_means():
     )
 
 
+@pytest.mark.full
 def test_a_system_in_seconds_has_a_rate():
     found = dt.point("tripod", "floquet", element="input", beta=0.1, zeta=0.01, excitation_frequency=50.0)
     assert found.growth["rate"] == pytest.approx(np.log(found.spectral_radius) * 50, rel=1e-12)
@@ -102,6 +104,7 @@ def test_a_point_without_result_has_no_sensitivities():
     assert "undecided" in repr(lost) and "spectral radius is 1" not in repr(lost)
 
 
+@pytest.mark.full
 def test_a_point_gives_sensitivities_by_its_physical_data_when_asked(capsys):
     point = DATA | {"speed": 3130.0}
     words = [f"{name}={value}" for name, value in point.items()]

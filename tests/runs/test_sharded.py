@@ -31,6 +31,7 @@ from drivetrain_jax.runs.status import status
 from drivetrain_jax.store import shards, zarr_store
 from drivetrain_jax.store.chunks import PartsFolder
 from drivetrain_jax.store.consolidate import read_attribute
+from tests.sizes import full_after
 
 pytest.importorskip("zarr")
 
@@ -68,7 +69,7 @@ FIXED_PATH = LINE | {"axes": {"a": {"values": [1.0, 2.0]}}, "fixed": {"b": 5.0}}
 POINTS = {"system": "toy", "analysis": "toy", "points": {"a": [1.0, 8.0, 9.5], "b": [1.0, 2.0, 3.0]}}
 
 
-@pytest.mark.parametrize("which", ["grid", "line", "one", "fixed path", "points"])
+@pytest.mark.parametrize("which", full_after(2, ["grid", "line", "one", "fixed path", "points"]))
 def test_export_is_bit_identical_to_the_file(grid_scene, tmp_path, which):
     scenes = {"grid": large(grid_scene), "line": LINE, "one": ONE, "fixed path": FIXED_PATH, "points": POINTS}
     scene = scenes[which]
@@ -131,7 +132,7 @@ def as_file(path):
     )
 
 
-@pytest.mark.parametrize("which", ["grid", "line", "one", "fixed path", "points"])
+@pytest.mark.parametrize("which", full_after(2, ["grid", "line", "one", "fixed path", "points"]))
 def test_xarray_opens_a_store_as_the_file(grid_scene, tmp_path, which, monkeypatch):
     monkeypatch.setattr(shards, "MOST_POINTS", 50)
     scenes = {"grid": large(grid_scene), "line": LINE, "one": ONE, "fixed path": FIXED_PATH, "points": POINTS}
@@ -184,6 +185,7 @@ SLOW = {
 }
 
 
+@pytest.mark.full
 def test_a_store_whose_run_is_killed_opens_and_is_resumed(tmp_path):
     """After two kills by SIGKILL no stored batch is lost, and the result has the bits of the file."""
     (tmp_path / "scene.toml").write_text(toml.write(SLOW))
@@ -307,7 +309,7 @@ def test_interrupted_damaged_and_resumed(grid_scene, tmp_path):
     identical(opened(tmp_path / "d.nc"), opened(tmp_path / "e.nc"))
 
 
-@pytest.mark.parametrize("name", ["value", "wave", "outcome", "shards"])
+@pytest.mark.parametrize("name", full_after(2, ["value", "wave", "outcome", "shards"]))
 def test_damage_of_a_finished_store_is_found(grid_scene, tmp_path, name):
     path = tmp_path / "r.zarr"
     to_store(grid_scene, path)
@@ -322,7 +324,7 @@ def test_damage_of_a_finished_store_is_found(grid_scene, tmp_path, name):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["r.zarr"]
 
 
-@pytest.mark.parametrize("name", ["scene", "digest", "title", "checksum"])
+@pytest.mark.parametrize("name", full_after(2, ["scene", "digest", "title", "checksum"]))
 @pytest.mark.parametrize("how", ["changed", "renamed", "gone"])
 def test_damage_of_the_attributes_is_found(tmp_path, capsys, name, how):
     path = tmp_path / "r.zarr"
@@ -362,7 +364,7 @@ def test_export_leaves_unfinished_work_alone(grid_scene, tmp_path):
     assert status(grid_scene, tmp_path / "e.nc").done == done > 0
 
 
-@pytest.mark.parametrize("kind", ["group", "array", "text", "attributes"])
+@pytest.mark.parametrize("kind", full_after(2, ["group", "array", "text", "attributes"]))
 def test_a_path_without_a_store_is_one_line(tmp_path, capsys, kind):
     import zarr
 
@@ -379,7 +381,7 @@ def test_a_path_without_a_store_is_one_line(tmp_path, capsys, kind):
         assert len(err) == 1 and ("not a readable Zarr store" in err[0] or "not a result of" in err[0])
 
 
-@pytest.mark.parametrize("place", ["outcome", "checksums", "checksums/shards", "a"])
+@pytest.mark.parametrize("place", full_after(2, ["outcome", "checksums", "checksums/shards", "a"]))
 def test_broken_metadata_of_a_finished_store_are_found(grid_scene, tmp_path, place):
     path = tmp_path / "r.zarr"
     to_store(grid_scene, path)

@@ -292,15 +292,20 @@ def test_systems_are_found_by_name():
         get_system("cardn")
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("point", "rtol"),
-    [
-        ({"beta": 1.0, "Omega": 0.1, "zeta": 10.0}, 1e-9),
-        ({"beta": 0.5, "Omega": 0.1, "zeta": 3.0}, 1e-7),
-        pytest.param({"beta": 1.4, "Omega": 0.1, "zeta": 3.0}, 1e-11, marks=pytest.mark.full),
-        pytest.param({"beta": 1.0, "Omega": 0.02, "zeta": 10.0}, 1e-5, marks=pytest.mark.full),
-        ({"beta": 0.8, "Omega": 0.5, "zeta": 0.0}, 1e-9),
-    ],
+    full_after(
+        1,
+        [
+            ({"beta": 1.0, "Omega": 0.1, "zeta": 10.0}, 1e-9),
+            ({"beta": 0.5, "Omega": 0.1, "zeta": 3.0}, 1e-7),
+            ({"beta": 1.4, "Omega": 0.1, "zeta": 3.0}, 1e-11),
+            ({"beta": 1.0, "Omega": 0.02, "zeta": 10.0}, 1e-5),
+            ({"beta": 0.8, "Omega": 0.5, "zeta": 0.0}, 1e-9),
+        ],
+        several=True,
+    ),
 )
 def test_predicted_steps_are_enough_and_not_many_more(point, rtol):
     """A decay is limited by stability and not by accuracy, and needs fewer steps than an oscillation of the same rate."""

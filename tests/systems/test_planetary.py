@@ -12,6 +12,7 @@ import drivetrain_jax as dt
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.runs.scene import load_scene
 from tests.oracles.planetary_reference import TABLE_2, exact_frequencies, matrices
+from tests.sizes import full_after
 
 SCENE = {"system": "planetary", "analysis": "modes"}
 LISTS = {"m_p": (0.6, 0.66, 0.7), "I_p": (0.61, 0.55, 0.5), "k_rp": (4e8, 5e8, 6e8)}
@@ -65,7 +66,9 @@ def test_rotations_of_four_planets():
 
 @pytest.mark.parametrize(
     ("count", "given", "method"),
-    [(1, {}, "auto"), (2, HELD, "full"), (3, LISTS, "auto"), (5, HELD, "auto"), (5, {}, "full")],
+    full_after(
+        1, [(3, LISTS, "auto"), (5, HELD, "auto"), (1, {}, "auto"), (2, HELD, "full"), (5, {}, "full")], several=True
+    ),
 )
 def test_rotations_are_the_plane_gear_with_its_centres_held(count, given, method):
     angles = (0.0, 1.9, 4.0, 4.4, 5.9)[:count]
@@ -85,7 +88,10 @@ def test_rotations_are_the_plane_gear_with_its_centres_held(count, given, method
         {"pressure_angle_s": 0.35, "pressure_angle_r": 0.5},
         pytest.param({"pressure_angle_s": 0.35}, marks=pytest.mark.full),
         pytest.param({"k_sx": 2e8, "k_sy": 5e7, "k_rx": 3e8, "k_cy": 4e8}, marks=pytest.mark.full),
-        {"k_sy": 0.0, "pressure_angle_r": 0.1, "m_p": (0.6, 0.66, 0.7, 0.5), "k_p": (1e8, 2e8, 1e8, 3e8)},
+        pytest.param(
+            {"k_sy": 0.0, "pressure_angle_r": 0.1, "m_p": (0.6, 0.66, 0.7, 0.5), "k_p": (1e8, 2e8, 1e8, 3e8)},
+            marks=pytest.mark.full,
+        ),
     ],
 )
 @pytest.mark.parametrize("angles", [(0.0, 1.4, 3.2, 4.5), (0.0, math.pi / 2, math.pi, 3 * math.pi / 2)])
@@ -95,12 +101,14 @@ def test_pressure_angles_and_bearings_that_differ(angles, given):
     np.testing.assert_allclose(found, exact, rtol=1e-12, atol=1e-8)
 
 
+@pytest.mark.full
 def test_derived_parameters_follow_until_they_are_given():
     plain = frequencies(dt.Planetary(k_s=3e8, pressure_angle=0.3))
     same = dt.Planetary(k_s=1.0, k_sx=3e8, k_sy=3e8, pressure_angle=0.4, pressure_angle_s=0.3, pressure_angle_r=0.3)
     np.testing.assert_array_equal(plain, frequencies(same))
 
 
+@pytest.mark.full
 def test_bearings_by_direction_split_doublets_and_keep_the_families():
     """With equal spacing k_sx splits every translational pair; rotational and planet modes do not change."""
     equal, split = (dt.modes(dt.Planetary(**more), outputs=EVERYTHING) for more in ({}, {"k_sx": 2e8}))

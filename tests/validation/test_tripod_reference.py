@@ -80,6 +80,7 @@ def test_multipliers(floquet):
         np.testing.assert_allclose(np.poly(found), np.poly(expected), rtol=0, atol=1e-12)
 
 
+@pytest.mark.full
 def test_no_instability_in_the_range_of_the_paper():
     """zeta, frequency and chi_n (derived, as printed, stated) of the paper: the largest exponent is far below zero."""
     axes = {

@@ -39,13 +39,6 @@ def test_a_name_stands_where_the_tongue_is_not(opens, side):
     assert sides(tipped([0.5], opens, [1.0])) == {(1.0, 0.5): side}
 
 
-@pytest.mark.parametrize(
-    ("place", "opens", "side"), [((1.0, 0.01), 1, RIGHT), ((1.49, 0.01), 1, LEFT), ((1.0, 0.99), 0, RIGHT)]
-)
-def test_a_name_does_not_lie_on_the_frame(place, opens, side):
-    assert sides(tipped([place[1]], [opens], [place[0]])) == {place: side}
-
-
 def test_a_name_does_not_cover_another():
     found = sides(tipped([0.5, 0.52], [1, 1], [1.0, 1.0]))
     assert found == {(1.0, 0.5): DOWN, (1.0, 0.52): RIGHT}

@@ -1,7 +1,8 @@
-"""Cells end halfway between their values on any axis."""
+"""Cells end halfway between their values on any axis; numbers, titles and captions of a figure."""
 
 from __future__ import annotations
 
+import matplotlib
 import numpy as np
 import pytest
 import xarray as xr
@@ -10,7 +11,7 @@ from matplotlib.figure import Figure
 
 from drivetrain_jax.view import cells, plot
 from drivetrain_jax.view.figure_layout import Panels, write_title
-from drivetrain_jax.view.style import axis_label, caption, value_text, variable_label
+from drivetrain_jax.view.style import STYLE, axis_label, caption, value_text, variable_label
 from tests.view import results
 from tests.view.test_stability import meshes, panels
 
@@ -93,15 +94,6 @@ def test_a_strip_shows_what_is_still_to_be_computed():
     assert strip.get_array().shape == (1, 3)
 
 
-@pytest.mark.parametrize(("letters", "cut"), [(20, False), (50, False), (300, True)])
-def test_a_title_is_never_wider_than_the_figure(letters, cut):
-    figure = Panels(height=2.0).figure
-    write_title(figure, xr.Dataset(attrs={"title": "W" * letters}), 0.75)
-    (title,) = figure.texts
-    extent = title.get_window_extent(FigureCanvasAgg(figure).get_renderer())
-    assert extent.x1 <= figure.bbox.x1 and title.get_text().endswith("\u2026") == cut
-
-
 @pytest.mark.parametrize(
     ("title", "text"),
     [
@@ -164,3 +156,22 @@ def test_axes_and_results_have_prefixes_together_with_their_numbers():
     np.testing.assert_array_equal(shown["torque"], [2.0, np.nan, 0.0])
     assert variable_label(shown["torque"]) == "torque [kN m]"
     assert caption(shown) == "$k_{B}$ = 85 MN/m"
+
+
+def test_small_and_large_numbers_have_a_power_of_ten_at_the_axis():
+    with matplotlib.rc_context(STYLE):
+        panels = Panels(2, height=1.5, share_y=False)
+        for (axes,), top in zip(panels.axes, (8e-4, 0.03), strict=True):
+            axes.set_ylim(0, top)
+        panels.figure.draw_without_rendering()
+    offsets = [axes.yaxis.get_offset_text().get_text() for (axes,) in panels.axes]
+    assert r"\times" in offsets[0] and "10^{\N{MINUS SIGN}4}" in offsets[0] and offsets[1] == ""
+
+
+def test_a_million_on_a_logarithmic_axis_is_a_power_of_ten():
+    axes = Figure().add_subplot()
+    axes.set(xscale="log", xlim=(1e-2, 1e6))
+    cells.plain_decades(axes, "x")
+    axes.figure.draw_without_rendering()
+    labels = [label.get_text() for label in axes.get_xticklabels()]
+    assert "$\\mathdefault{10^{6}}$" in labels and not any("e+" in label for label in labels)

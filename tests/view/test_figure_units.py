@@ -73,6 +73,7 @@ def test_fixed_values_have_the_unit_of_the_scene_or_of_the_axes():
     assert "angle = 28.6479 deg, length = [300, 1200] mm" in texts(plot(dataset, units="deg"))
 
 
+@pytest.mark.full
 def test_angles_of_planets_have_the_unit_given_or_asked_for():
     """The angle of the second planet is an axis of one value, so it is a number of the list, too."""
     fixed = {"planet_angle": {"value": [0.0, np.pi / 2, np.pi], "units": "rad"}}
@@ -91,6 +92,7 @@ def test_angles_of_planets_have_the_unit_given_or_asked_for():
         plot(dataset, units="kg")
 
 
+@pytest.mark.full
 def test_flanks_and_phase_follow_the_units_of_their_axes():
     """A gear pair with 0.1 mm backlash: flanks at 50 micrometres from the middle, in any unit."""
     gears = dt.Rattle(omega=0.9, B0=0.05, B1=0.03, b=5e-5, c=0.05, alpha=0.25, k=1.0, I=1.0)

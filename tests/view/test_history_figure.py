@@ -89,16 +89,6 @@ def test_nothing_to_plot_is_an_input_error():
         plot(history(zeta=[0.1, 0.2], beta=[0.1, 0.2]))
 
 
-def test_a_long_caption_stays_in_the_figure():
-    dataset = history(phi0=[0.0, 0.1])
-    dataset.attrs["fixed_parameters"] = json.dumps({f"length_{k}": 0.123456 for k in range(30)})
-    figure = plot(dataset)
-    figure.draw_without_rendering()
-    title, text = (figure.texts[k].get_window_extent() for k in (0, 1))
-    assert text.x1 <= figure.bbox.x1 and text.y1 <= title.y0
-    assert text.y0 > max(axes.get_tightbbox().y1 for axes in figure.axes)
-
-
 @pytest.mark.parametrize(
     ("name", "text"),
     [

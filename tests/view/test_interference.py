@@ -43,6 +43,7 @@ def test_five_planets_meet_the_mesh_at_590_593_and_892_rpm():
     assert stored["values"]["mesh order 1"][:2] == [None, pytest.approx(first[1])] and stored["units"] == "rpm"
 
 
+@pytest.mark.full
 def test_without_teeth_no_order_is_known():
     found = dt.point("planetary", "modes", outputs=["natural_frequency"])
     assert found.crossings == {} and "order" not in repr(found) and "crossings" not in found.to_json()
@@ -86,6 +87,7 @@ def test_the_diagram_crosses_every_order_with_every_mode(gear):
     assert "590–593" in [text.get_text() for text in axes.texts]
 
 
+@pytest.mark.full
 def test_with_an_operating_range_the_diagram_shows_its_surroundings(shaft):
     figure = shaft.drivetrain.plot()
     axes = figure.axes[0]
@@ -96,6 +98,7 @@ def test_with_an_operating_range_the_diagram_shows_its_surroundings(shaft):
     assert axes.get_ylim()[1] < 217
 
 
+@pytest.mark.full
 def test_mode_shapes_are_drawn_if_they_are_stored():
     scene = {"system": "planetary", "analysis": "modes", "fixed": GEAR, "outputs": ["natural_frequency", "mode_shape"]}
     assert len(dt.run(scene).drivetrain.plot().axes) > 4
@@ -107,6 +110,7 @@ def test_a_report_names_the_crossings(gear, shaft):
     assert "From 3000 to 4500 rpm of the shaft: order 2 (joints) meets mode 2 at 4043.92 rpm." in statements(shaft)
 
 
+@pytest.mark.full
 def test_crossings_along_an_axis():
     scene = {"system": "planetary", "analysis": "modes", "outputs": ["natural_frequency"], "axes": {"k_p": [1e8, 2e8]}}
     found = dt.run(scene | {"fixed": {"teeth": [20, 26, 72]}})
