@@ -31,22 +31,12 @@ def sides(dataset) -> dict[tuple[float, float], tuple[int, int]]:
     return {tuple(map(float, name.xy)): tuple(int(np.sign(x)) for x in name.xyann) for name in names}
 
 
-DOWN, UP, RIGHT, LEFT = (0, -1), (0, 1), (1, 0), (-1, 0)
+DOWN, UP = (0, -1), (0, 1)
 
 
 @pytest.mark.parametrize(("opens", "side"), [([1], DOWN), (None, DOWN), ([0], UP)])
 def test_a_name_stands_where_the_tongue_is_not(opens, side):
     assert sides(tipped([0.5], opens, [1.0])) == {(1.0, 0.5): side}
-
-
-def test_a_name_does_not_cover_another():
-    found = sides(tipped([0.5, 0.52], [1, 1], [1.0, 1.0]))
-    assert found == {(1.0, 0.5): DOWN, (1.0, 0.52): RIGHT}
-
-
-def test_two_tips_in_one_place_share_a_name():
-    both = tipped([0.5, 0.501, 0.9], [1, 1, 1], [1.0, 1.0, 1.0]).assign_coords(tip=("tip", ["C-1", "C-1", "C-1"]))
-    assert sides(both) == {(1.0, 0.5): DOWN, (1.0, 0.9): DOWN}
 
 
 def test_a_chart_tells_which_way_tongues_open():

@@ -62,14 +62,6 @@ def test_values_given_out_of_order_are_sorted():
     np.testing.assert_array_equal(meshes(plot(dataset))[0].get_array(), [[0, 0, 0], [0, 1, 0]])
 
 
-@pytest.mark.parametrize(("limits", "first"), [((100.0, 2e5), "100"), ((100.0, 1e8), "$\\mathdefault{10^{2}}$")])
-def test_long_numbers_on_a_logarithmic_axis_are_powers_of_ten(limits, first):
-    axes = Figure().add_subplot()
-    axes.set(yscale="log", ylim=limits)
-    cells.plain_decades(axes, "y")
-    assert axes.yaxis.get_major_formatter()(100.0, 0) == first
-
-
 def test_cells_still_to_be_computed_are_not_failed():
     codes = np.array([[0, 1, 3], [3, 0, 1]])
     chart = results.with_axes(results.grid(codes, "beta", "Omega"), beta=np.arange(2.0), Omega=np.arange(3.0))

@@ -11,7 +11,6 @@ from matplotlib.contour import QuadContourSet
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import plot
-from drivetrain_jax.view.figure_layout import wrap_caption
 
 MODE = ("mode", [1, 2, 3])
 
@@ -87,11 +86,6 @@ def test_operating_speeds_are_a_band(swept, variable, low, drawn):
     assert "operating speeds" in [text.get_text() for text in figure.legends[0].get_texts()]
 
 
-def test_without_operating_speeds_there_is_no_band(swept):
-    options = json.dumps({"operating_min": 0.0, "operating_max": 0.0})
-    assert not plot(swept.assign_attrs(options=options)).axes[0].patches
-
-
 def test_maps_show_where_a_mode_meets_the_operating_speeds():
     """Critical speeds are k_A + k_D + 10 mode: mode 1 meets both limits, mode 2 the upper limit, mode 3 none."""
     k = np.linspace(1.0, 9.0, 9)
@@ -165,13 +159,6 @@ def test_results_without_a_positive_value_are_refused(swept, value, shown):
         plot(empty)
     with pytest.raises(InputError, match=line):
         plot(empty.isel(k_D=[0, 1]).expand_dims(k_A=[1.0, 2.0]))
-
-
-def test_what_does_not_fit_gives_way_to_an_ellipsis():
-    text = ", ".join(f"$k_{{{letter}}}$ = [1, 2] N" for letter in "ABCDEFGH")
-    lines = wrap_caption(text, 2.0, 2).split("\n")
-    assert len(lines) == 2 and lines[1].endswith(", …") and lines[0].endswith(",")
-    assert wrap_caption(text, 100.0, 2) == text and wrap_caption("", 2.0, 2) == ""
 
 
 def test_shapes_are_drawn_over_the_shaft_with_its_points():

@@ -142,7 +142,3 @@ def test_many_turns_are_thinned_between_their_envelopes():
     assert abs(above.shape[1] - 300) <= 1 and abs(below.shape[1] - 300) <= 1
     np.testing.assert_allclose(above[0], np.exp(-2 * above[2]), rtol=2e-3)
     np.testing.assert_allclose(below[0], -np.exp(-2 * below[2]), rtol=2e-3)
-
-
-def test_a_power_of_ten_alone_has_no_factor():
-    assert value_text("a", 1e-6) == "$a$ = 10⁻⁶" and value_text("a", 1.5e-5) == "$a$ = 1.5×10⁻⁵"

@@ -10,7 +10,6 @@ import pytest
 import drivetrain_jax as dt
 from drivetrain_jax.cli import main
 from drivetrain_jax.report.statements import statements
-from drivetrain_jax.resonances.orders import orders_of
 
 ANGLES = ["0 deg", "72 deg", "144 deg", "219 deg", "288 deg"]
 GEAR = {"planet_angle": ANGLES, "teeth": [20, 26, 72]}
@@ -41,13 +40,6 @@ def test_five_planets_meet_the_mesh_at_590_593_and_892_rpm():
     assert "  2     590.472" in repr(found) and "speed of the carrier at which an order meets the mode" in repr(found)
     stored = json.loads(found.to_json())["crossings"]
     assert stored["values"]["mesh order 1"][:2] == [None, pytest.approx(first[1])] and stored["units"] == "rpm"
-
-
-@pytest.mark.full
-def test_without_teeth_no_order_is_known():
-    found = dt.point("planetary", "modes", outputs=["natural_frequency"])
-    assert found.crossings == {} and "order" not in repr(found) and "crossings" not in found.to_json()
-    assert orders_of("cardan", {}) is None
 
 
 @pytest.mark.full
@@ -85,23 +77,6 @@ def test_the_diagram_crosses_every_order_with_every_mode(gear):
         np.testing.assert_allclose(frequency, gear.natural_frequency[1:], rtol=1e-14)
         np.testing.assert_allclose((heights / ends)[0], frequency / speeds, rtol=1e-12)
     assert "590–593" in [text.get_text() for text in axes.texts]
-
-
-@pytest.mark.full
-def test_with_an_operating_range_the_diagram_shows_its_surroundings(shaft):
-    figure = shaft.drivetrain.plot()
-    axes = figure.axes[0]
-    assert axes.get_xlim() == (0, 1.4 * 4500) and axes.get_xscale() == "linear"
-    assert "4044" in [text.get_text() for text in axes.texts]
-    assert "operating speeds" in [text.get_text() for text in figure.legends[0].get_texts()]
-    # Order 2 reaches 210 Hz; the third mode, at 217 Hz, is not shown.
-    assert axes.get_ylim()[1] < 217
-
-
-@pytest.mark.full
-def test_mode_shapes_are_drawn_if_they_are_stored():
-    scene = {"system": "planetary", "analysis": "modes", "fixed": GEAR, "outputs": ["natural_frequency", "mode_shape"]}
-    assert len(dt.run(scene).drivetrain.plot().axes) > 4
 
 
 def test_a_report_names_the_crossings(gear, shaft):

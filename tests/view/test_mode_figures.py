@@ -11,7 +11,7 @@ from matplotlib.colors import to_hex
 
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis.modes.figure import type_colours
-from drivetrain_jax.analysis.modes.planetary_gear import displacements, drawn_radii
+from drivetrain_jax.analysis.modes.planetary_gear import displacements
 from drivetrain_jax.systems._planetary_springs import coordinate_names
 from drivetrain_jax.view import plot
 
@@ -81,15 +81,6 @@ def test_a_split_of_three_hertz_is_drawn_in_hertz():
     assert lower.get_ylabel() == upper.get_ylabel() == "" and lower.get_yscale() == "log"
 
 
-@pytest.mark.parametrize("angles", [np.arange(6) * np.pi / 3, [0.0, 1.1, 3.0], [0.0, 2.0, 4.0]])
-def test_planets_at_rest_do_not_overlap(angles):
-    sun, planet, ring = drawn_radii(angles)
-    centres = np.exp(1j * np.asarray(angles))
-    distances = np.abs(centres[:, None] - centres)[~np.eye(len(centres), dtype=bool)]
-    assert distances.min() > 2 * planet and sun + planet == pytest.approx(1, abs=0.01)
-    assert ring - planet == pytest.approx(1, abs=0.02)
-
-
 def shapes(planets: int = 3) -> xr.Dataset:
     size = 9 + 3 * planets
     frequency = np.array([[0.0, 5.0, 5.0, *range(10, 10 + size - 3)]], float)
@@ -130,14 +121,6 @@ def test_without_translations_the_carrier_carries_the_planets():
     central, planets = displacements({"u_c": 1.0, "u_r": 0.0, "u_s": -2.0, "u_1": 0.5, "u_2": 0.0}, 2)
     np.testing.assert_allclose(central, 0.14 * np.array([[0, 0, 1], [0, 0, 0], [0, 0, -2]]))
     np.testing.assert_allclose(planets, 0.14 * np.array([[0, 1, 0.5], [0, 1, 0]]))
-
-
-def test_a_coupled_mode_shows_its_dominant_family():
-    found = shapes().assign(mode_type=(("k_p", "mode"), np.full((1, 18), 4, "int8"), crossing().mode_type.attrs))
-    family = {"flag_values": np.arange(4, dtype="int8"), "flag_meanings": "rotational translational planet none"}
-    found["dominant_family"] = ("k_p", "mode"), np.ones((1, 18), "int8"), family
-    found["dominant_share"] = ("k_p", "mode"), np.full((1, 18), 0.999899)
-    assert plot(found).axes[0].get_title() == "0.0 Hz\n99.98 % translational"
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import plot
@@ -24,14 +23,6 @@ def test_amplitude_of_both_shafts_over_one_axis():
     assert [set(line.get_ydata()) for line in orbit.lines[:2]] == [{1.1 - 1}, {0}]
     assert legend(figure) == ["driving shaft, linear", "driven shaft, linear", "limit of stability", "harmonic $H$"]
     assert {"amplitude [rad]", "spectral radius of the orbit minus 1", "speed ($\\Omega$)"} <= set(texts(figure))
-
-
-def test_an_orbit_close_to_its_limit_is_told_from_it():
-    dataset = results.forced(Omega=OMEGA)
-    dataset.orbit_spectral_radius[:] = 1 - 1e-5
-    orbit = panels(plot(dataset))[1]
-    place = orbit.transAxes.inverted().transform(orbit.transData.transform([(1.0, -1e-5), (1.0, 0.0)]))[:, 1]
-    assert place[1] - place[0] > 0.1
 
 
 def test_only_harmonic_speeds_are_predicted_for_a_response():
@@ -94,26 +85,3 @@ def test_unknown_analysis_is_an_input_error():
         plot(results.forced(Omega=OMEGA).assign_attrs(analysis="atlas"))
     with pytest.raises(InputError, match="analysis = 'anything': has no figure; allowed is one of floquet, forced"):
         plot(results.forced(Omega=OMEGA).assign_attrs(analysis="anything"))
-
-
-def test_planets_with_equal_responses_stay_visible_and_are_named():
-    frequency = np.linspace(1.0, 2.0, 5)
-    amplitude = np.full((5, 4), 1e-6)
-    dataset = xr.Dataset(
-        {
-            "amplitude": (("frequency", "dof"), amplitude, {"units": "m", "long_name": "amplitude"}),
-            "outcome": ((), np.int8(0)),
-        },
-        {"frequency": ("frequency", frequency, {"units": "Hz"}), "dof": ["x_c", "xi_1", "xi_2", "xi_3"]},
-        {"analysis": "harmonic_response", "title": "Gear"},
-    )
-    figure = plot(dataset)
-    widths = [line.get_linewidth() for line in figure.axes[1].lines]
-    assert widths == sorted(widths, reverse=True) and len(set(widths)) == 3
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
-        "carrier",
-        "planet 1",
-        "planet 2",
-        "planet 3",
-    ]
-    assert {"translation $x$ [m]", r"radial motion $\xi$ [m]"} <= set(texts(figure))

@@ -90,11 +90,6 @@ def basin(multiple):
     return dataset
 
 
-def test_motions_have_letters_instead_of_numbers():
-    assert labels(plot(basin([1, 1, 4, 4]))) == ["motion A", "motion B"]
-    assert labels(plot(basin([1, 1, 1, 1]))) == ["motion A"]
-
-
 def test_basins_show_the_share_of_every_attractor():
     high = np.array([[0.5, 0.5, 0.7], [0.5, 0.7 * (1 + 1e-7), 0.5]])
     axes = {"u0": [-1.0, 1.0], "v0": [-1.0, 0.0, 1.0]}
@@ -109,19 +104,6 @@ def test_curves_mark_what_is_not_periodic():
     figure = plot(result({"omega": [0.5, 1.0, 1.5]}, u_max=[1.0, 2.0, 3.0], period_multiple=multiple))
     assert "non-periodic" in labels(figure)
     np.testing.assert_array_equal(figure.axes[1].lines[0].get_ydata(), multiple)
-
-
-def test_curves_tell_failures_from_motions_that_are_not_periodic():
-    """Failed points have the period multiple 0 like non-periodic motions, but other marks."""
-    dataset = result({"omega": [0.5, 1.0, 1.5]}, u_max=[1.0, 2.0, np.nan], period_multiple=[1, 0, 0])
-    dataset["outcome"][2] = 2
-    figure = plot(dataset)
-    assert labels(figure) == ["u_max", "non-periodic", "flanks", "failed (1)"]
-    np.testing.assert_array_equal(figure.axes[1].lines[0].get_ydata(), [1, 0, np.nan])
-    (crosses,) = [line for line in figure.axes[0].lines if line.get_label() == "failed (1)"]
-    assert crosses.get_xdata().tolist() == [1.5]
-    dataset["outcome"][:] = 2
-    assert labels(plot(dataset)) == ["u_max", "flanks", "failed (3)"]
 
 
 def test_curves_show_both_flanks_and_bands_of_the_regimes():
@@ -171,12 +153,3 @@ def test_a_motion_without_values_is_refused():
     dataset = dataset.assign({name: ("sample", empty) for name in ("u_history", "v_history")})
     with pytest.raises(InputError, match="u_history = nan: nothing to plot"):
         plot(dataset)
-
-
-def test_a_motion_close_to_its_limit_is_told_from_it():
-    ones = np.ones(4)
-    radius = {"spectral_radius": [0.3, 1 - 1e-4, 1 - 1e-5, 1 - 1e-5]}
-    figure = plot(result({"omega": [0.1, 0.2, 0.3, 0.4]}, u_max=ones, u_min=-ones, **radius))
-    axes = figure.axes[1]
-    place = axes.transAxes.inverted().transform(axes.transData.transform([(0.3, -1e-5), (0.3, 0.0)]))[:, 1]
-    assert place[1] - place[0] > 0.1 and any(text.get_text().endswith("minus 1") for text in figure.texts)
