@@ -60,6 +60,7 @@ def test_cache_is_off_by_setting_or_without_a_folder(tmp_path, setting):
     assert folder_used(SWEEP, DRIVETRAIN_JAX_CACHE=setting, XDG_CACHE_HOME=str(tmp_path)) == "None"
 
 
+@pytest.mark.full
 def test_calls_compile_once_for_all_processes(tmp_path):
     def entries() -> dict[str, int]:
         return {x.name: x.stat().st_mtime_ns for x in Path(folder).iterdir() if x.name.endswith("-cache")}

@@ -105,7 +105,7 @@ OPTIONS = {
 
 SLOW = (
     *("cardan forced", "tripod history", "tripod lyapunov", "tripod poincare", "rattle frequency_response"),
-    *("bicardan critical_speeds", "planetary harmonic_response", "planetary modes"),
+    *("bicardan critical_speeds", "planetary harmonic_response", "planetary modes", "rattle basins", "tripod floquet"),
 )
 
 

@@ -26,9 +26,7 @@ def request(method: str, rtol: float, outputs=EVERYTHING, **options) -> Request:
 class FloquetBatch:
     """Results by name for arrays of parameters, with the points as first axis, by falling cost of their solver."""
 
-    def __init__(
-        self, method="direct", system: System = CARDAN, outputs=EVERYTHING, chunk=(256, 8, 256, 64), **options
-    ):
+    def __init__(self, method="direct", system: System = CARDAN, outputs=EVERYTHING, chunk=(64, 8, 64, 64), **options):
         self.method, self.system, self.outputs, self.options = method, system, outputs, options
         self.chunk = chunk
         self.names = system.models["floquet"].parameters

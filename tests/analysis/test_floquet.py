@@ -90,8 +90,8 @@ def test_error_bound_holds(sample):
 
 
 @pytest.mark.full
-def test_error_bound_holds_on_200000_points(direct):
-    points = random_points(200_000, 14)
+def test_error_bound_holds_on_200000_points():
+    points, direct = random_points(200_000, 14), FloquetBatch("direct", chunk=(256, 8, 256, 64))
     assert_bound_holds(direct(points), direct(points, rtol=1e-13))
 
 

@@ -106,9 +106,9 @@ def test_long_memory_meets_the_target(rtol):
         1,
         [
             ("Dopri8", 20e3, 1e-7, 0.2),
-            pytest.param("Dopri8", 12e3, 1e-5, 0.2, marks=pytest.mark.full),
+            ("Dopri8", 12e3, 1e-5, 0.2),
             ("Tsit5", 40e3, 1e-5, 0.1),
-            pytest.param("Kvaerno5", 60e3, 1e-4, 0.1, marks=pytest.mark.full),
+            ("Kvaerno5", 60e3, 1e-4, 0.1),
         ],
         several=True,
     ),

@@ -96,6 +96,7 @@ def test_scaling_of_all_stiffnesses(jacobian, frequencies):
     np.testing.assert_allclose(total[1:], frequencies[1:] / 2, rtol=1e-11)
 
 
+@pytest.mark.full
 def test_masses_of_a_stiff_gear():
     """Derivatives by a mass with nearly rigid springs, whose forces cancel."""
     stiff = UNEQUAL | {"k_rp": 1e20}
@@ -107,11 +108,13 @@ def test_masses_of_a_stiff_gear():
     np.testing.assert_allclose(slope[soft], exact, rtol=0, atol=1e-8 * np.abs(exact).max())
 
 
+@pytest.mark.full
 def test_turning_the_gear_changes_nothing(jacobian, frequencies):
     total = np.asarray(sum(jacobian["planet_angle"]))
     assert np.abs(total).max() < 1e-9 * frequencies.max()
 
 
+@pytest.mark.full
 @pytest.mark.full
 def test_only_a_parameter_splitting_a_doublet_has_no_derivative():
     """With equal spacing the common bearing of planets keeps the translational doublets; an angle splits all six."""
@@ -125,6 +128,7 @@ def test_only_a_parameter_splitting_a_doublet_has_no_derivative():
     np.testing.assert_allclose(np.asarray(rows.k_p)[1:], exact[1:], rtol=2e-6, atol=2e-7 * np.abs(exact[1:]).max())
 
 
+@pytest.mark.full
 def test_a_rigid_mode_stays_but_for_a_spring_that_would_hold_it(jacobian):
     """For such a spring the frequency grows like sqrt(k); all other modes have derivatives."""
     for name in NAMES:

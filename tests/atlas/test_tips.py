@@ -346,6 +346,7 @@ def test_gradients_of_the_radius():
         assert slope == pytest.approx((values[1] - values[0]) / (2 * h), rel=1e-5, abs=1e-9)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("inside", "exists"), full_after(1, [(1e-15, False), (1e-10, True)], several=True))
 def test_gradient_at_multipliers_equal_to_rounding(inside, exists):
     """Near the edge of S21 without damping, known to 30 digits, d rho/d Omega = 0.20180 (Omega - edge)^(-1/2)."""

@@ -18,13 +18,14 @@ pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="fa
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
     found, modules = list(sys.path), set(sys.modules)
-    yield Bench(tmp_path_factory.mktemp("faults"), points=8_000, seed=3)
+    yield Bench(tmp_path_factory.mktemp("faults"), points=40_000, seed=3)
     # The system that it installs is not one of the package for other tests.
     sys.path[:] = found
     for name in {"light"} & (set(sys.modules) - modules):
         del sys.modules[name]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", [name for name, _, _, short in KINDS if short])
 def test_nothing_is_lost_and_nothing_is_wrong(bench, kind):
     function = next(function for name, function, _, _ in KINDS if name == kind)

@@ -128,6 +128,7 @@ def test_units_are_those_asked_for_or_those_of_the_scene(truck, tmp_path):
     assert "Unstable at speed = 1425 rpm." in text and " angle joint angle 12 deg" in text
 
 
+@pytest.mark.full
 def test_a_unit_that_nothing_measures_is_refused(truck, files, tmp_path, capsys):
     for option, value, words in (
         ("--units", "kg m", "units = 'kg m': nothing in the report measures that; allowed are units of"),

@@ -292,6 +292,7 @@ def test_stable_intervals_away_from_the_safe_end_are_listed():
     assert degrees["angle"]["value"] == pytest.approx([65.564609, 77.760540], abs=1e-5)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("speeds", "kind", "value"),
     full_after(1, [((1.3, 1.5), "crossing", S21[0]), ((1.415, 1.417), "undecided", 0.1062824374)], several=True),

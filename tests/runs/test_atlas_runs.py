@@ -232,6 +232,7 @@ def test_the_function_of_the_parameters(atlas, direct):
     assert line["spectral_radius"].dims == ("Omega",) and float(line["beta"] if "beta" in line.coords else 0.31) == 0.31
 
 
+@pytest.mark.full
 def test_single_points_empty_arrays_and_wrong_shapes(atlas):
     point = atlas.grid(beta=0.31, Omega=1.2)
     assert point["spectral_radius"].shape == ()
@@ -422,6 +423,7 @@ def test_physical_arrays_and_four_digits(atlas):
         atlas(**shaft | {"k2": 1002.0}, speed=250.0, angle=10)
 
 
+@pytest.mark.full
 def test_design_answers_are_checked_by_direct_solves(atlas):
     angle = atlas_answers.widest_angle(atlas, {"Omega": (1.3, 1.5)})
     assert angle.data["value"] == pytest.approx(0.1063331213, abs=1e-8)  # the tip of S21

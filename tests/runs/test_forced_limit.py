@@ -57,6 +57,7 @@ def test_a_point_compares_its_forced_motion_with_a_limit(limit, within):
     assert json.loads(found.to_json())["forced"]["within"] is within
 
 
+@pytest.mark.full
 def test_an_unstable_motion_is_never_within_a_limit(capsys):
     assert main(["point", "cardan", "floquet", *WORDS, "speed=1425", "--amplitude", "80 deg"]) == 0
     assert "driven 2.67463 deg; unstable: the motion grows beyond the limit of 80 deg" in capsys.readouterr().out

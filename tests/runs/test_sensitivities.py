@@ -47,6 +47,7 @@ def test_limits_move_as_those_of_changed_shafts(atlas):
     assert f"at the upper end: +1 % of a value changes speed by [rpm]: {next(iter(effects))} +" in str(found)
 
 
+@pytest.mark.full
 def test_sensitivities_of_the_radius_are_sorted_and_physical(atlas):
     found = atlas_answers.query(atlas, {"speed": 3130.0})
     effects = {each["name"]: each for each in found.data["sensitivities"]}

@@ -103,7 +103,7 @@ def test_every_flipped_bit_that_a_reader_could_see_is_found(path, unscanned):
     whole, content = path.read_bytes(), seen(path)
     rng = np.random.default_rng(7)
     found = 0
-    for position in rng.integers(0, len(whole), 300):
+    for position in rng.integers(0, len(whole), 120):
         damaged = bytearray(whole)
         damaged[position] ^= 1 << rng.integers(8)
         path.write_bytes(damaged)
@@ -113,7 +113,7 @@ def test_every_flipped_bit_that_a_reader_could_see_is_found(path, unscanned):
             noticed = True
         found += noticed
         assert noticed or seen(path) == content, position
-    assert found > 30
+    assert found > 12
 
 
 @pytest.mark.parametrize("part", [0.0, 0.3, 0.9, 0.999])
