@@ -100,6 +100,7 @@ def exact_frequency(v: Mapping, p: float) -> mp.mpf:
     return mp.findroot(determinant, ends, verify=False)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", full_after(4, CASES))
 def test_discs_springs_and_segments_without_mass(name):
     """Finite elements give the number of frequencies and their values, transfer matrices in 120 digits their digits."""

@@ -366,9 +366,11 @@ def test_looser_target_is_met():
 
 
 @pytest.mark.parametrize(
-    "given", [{"Omega": 1.2}, {"Omega": 2.0}, {"Omega": 0.75, "zeta": 0.0, "alpha": 0.0, "gamma": 1.0}], ids=str
+    "given",
+    full_after(1, [{"Omega": 1.2}, {"Omega": 2.0}, {"Omega": 0.75, "zeta": 0.0, "alpha": 0.0, "gamma": 1.0}]),
+    ids=str,
 )
-@pytest.mark.parametrize("rtol", full_after(1, full_after(1, [1e-6, 1e-4])))
+@pytest.mark.parametrize("rtol", full_after(1, [1e-6, 1e-4]))
 def test_stated_error_of_the_orbit_bounds_the_true_one(given, rtol):
     """The last Newton correction is no estimate of the error: it is up to 2e5 times smaller."""
     given = {"beta": 0.3} | given

@@ -59,7 +59,7 @@ def test_a_response_and_its_branch():
             ("multiple_scales", {}, ["peak_frequency", "fold_frequency"]),
             ("multiple_scales", {"fit_range": 1.0}, ["peak_frequency", "fold_frequency"]),
             ("describing_function", {}, ["peak_frequency", "fold_frequency"]),
-            pytest.param("harmonic_balance", {"harmonics": 3}, [], marks=pytest.mark.full),
+            ("harmonic_balance", {"harmonics": 3}, []),
         ],
         several=True,
     ),

@@ -51,8 +51,8 @@ class InTurns(InSeconds):
         return FloquetModel(form, form)
 
 
-@pytest.mark.parametrize("damping", [0.1, 40.0])
-@pytest.mark.parametrize("method", full_after(1, full_after(1, ["direct", "diffrax"])))
+@pytest.mark.parametrize("damping", full_after(1, [0.1, 40.0]))
+@pytest.mark.parametrize("method", full_after(1, ["direct", "diffrax"]))
 def test_both_clocks_have_the_same_multipliers(method, damping):
     def radius(system):
         def solve(speed):

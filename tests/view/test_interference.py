@@ -79,6 +79,7 @@ def test_the_diagram_crosses_every_order_with_every_mode(gear):
     assert "590–593" in [text.get_text() for text in axes.texts]
 
 
+@pytest.mark.full
 def test_a_report_names_the_crossings(gear, shaft):
     (sentence,) = [s for s in statements(gear) if s.startswith("Mesh order 1 ")]
     assert sentence.startswith("Mesh order 1 meets modes at 590.472, 592.899, 892.225, ") and "carrier" in sentence
