@@ -305,6 +305,7 @@ def test_an_infinite_result_is_missing_and_codes_are_known():
     assert coded.outcome.values.tolist() == [2, Outcome.NOT_FINITE]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("number", [np.float64, np.float32, np.array, jnp.array, jnp.float32])
 def test_fixed_values_may_be_numbers_of_numpy_and_jax(number):
     shaft = dt.Cardan(beta=number(0.25), Omega=1.5, **{name: number(value) for name, value in BASE.items()})

@@ -96,6 +96,7 @@ def test_a_scene_with_units_is_the_one_without():
     assert options.request.options["operating_max"] == 3000.0
 
 
+@pytest.mark.full
 def test_a_sweep_takes_units():
     shaft = dt.Cardan(beta="18 deg", Omega=1.4, **BASE)
     chart = dt.sweep(dt.floquet, shaft, over={"beta": ["9 deg", "18 deg"]}, outputs=["verdict"])

@@ -452,7 +452,7 @@ def test_other_package_adds_a_system(other_package):
         get_system("nothing of the kind")
 
 
-@pytest.mark.parametrize("method", ["direct", "diffrax"])
+@pytest.mark.parametrize("method", full_after(1, ["direct", "diffrax"]))
 def test_any_linear_periodic_system_is_analysed(other_package, method):
     """Mathieu's characteristic values bound the tongues; damping d multiplies the multipliers at a - d^2 by e^(-d pi)."""
     q, d = 1.3, 0.02

@@ -155,6 +155,7 @@ def test_chunks_agree_along_an_axis_that_predictions_depend_on(deep):
     assert found.chunks["mu"] == found["verdict"].chunksizes["mu"] and len(found.chunks["mu"]) > 10
 
 
+@pytest.mark.full
 def test_chunks_of_even_axes_reach_along_those_of_low_degree(deep):
     (panel, *_), names = dt.open_atlas(deep).stability.atlas.panels, ("beta", "Omega", "mu")
     chunks = opened(deep, 400, chunks={})["verdict"].chunksizes

@@ -346,6 +346,7 @@ def test_a_question_may_repeat_what_follows_from_the_data_of_the_atlas():
             atlas_answers.query(atlas, {"speed": 1425.0, **other})
 
 
+@pytest.mark.full
 def test_nothing_found_beside_undecided_ranges_is_not_nothing(monkeypatch):
     atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
     for undecided, text in (

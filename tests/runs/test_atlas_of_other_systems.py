@@ -60,6 +60,7 @@ def atlas():
     return dt.open_atlas(dt.run(SCENE))
 
 
+@pytest.mark.full
 def test_values_may_have_units(atlas):
     speed = 1.1 / (2 * math.pi)
     expected = atlas(omega=1.1).spectral_radius.item()

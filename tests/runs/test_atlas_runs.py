@@ -353,6 +353,7 @@ def test_fixed_values_may_be_given_again(atlas):
     xr.testing.assert_identical(found, atlas(beta=0.3, Omega=1.5))
 
 
+@pytest.mark.full
 def test_nearest_boundaries_of_a_point(atlas):
     reply = atlas_answers.query(atlas, {"beta": 0.31, "Omega": 1.2})
     data = json.loads(reply.to_json())

@@ -8,12 +8,13 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.cli import main
+from tests.sizes import full_after
 
 OLD = Path(__file__).parent.parent / "old_results"
 FILES = "chart", "response", "atlas"
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", full_after(2, FILES))
 def test_old_results_verify_and_plot(name, tmp_path, capsys):
     main(["verify", str(OLD / f"{name}.nc")])
     assert "checksums: all agree" in capsys.readouterr().out

@@ -156,6 +156,7 @@ def test_an_entry_and_an_addition_as_axes():
             np.testing.assert_allclose(result.angular_frequency[i, j], finite_elements(values, 3), rtol=1e-10)
 
 
+@pytest.mark.full
 def test_the_determinant_dies_near_mode_12(swept):
     """The determinant is right for the first modes, even with a rigid support; the count exposes its error at mode 13."""
     result = dt.run(

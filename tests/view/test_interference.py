@@ -67,6 +67,7 @@ def test_no_crossing_in_the_range_is_an_answer_too():
         dt.point("planetary", "modes", operating_min=10.0, **GEAR)
 
 
+@pytest.mark.full
 def test_the_diagram_crosses_every_order_with_every_mode(gear):
     axes = gear.drivetrain.plot().axes[0]
     assert axes.get_xscale() == axes.get_yscale() == "log"
