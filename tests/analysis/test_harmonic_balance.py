@@ -27,8 +27,8 @@ STEADY = {case["name"]: case for case in REFERENCE["steady"]}
 OMEGAS = np.array([0.35, 0.44, 0.6, 0.7, 0.755, 0.8, 0.84, 0.87, 0.9, 1.0])
 OUTPUTS = ("u_max", "u_min", "u_rms", "phase", "stability", "spectral_radius", "residual", "regime",
            "branch_u_max", "branch_u_min", "branch_stability")  # fmt: skip
-# Table 1, then b = 0, alpha = 1, alpha = 0, alpha > 1, no drive, no separation.
-CASES = ({}, {"b": 0.0}, {"alpha": 1.0}, {"alpha": 0.0}, {"alpha": 1.5}, {"B1": 0.0}, {"B1": 1e-4, "B0": 0.3})
+# Table 1, then b = 0, alpha = 1, alpha > 1, no drive, no separation.
+CASES = ({}, {"b": 0.0}, {"alpha": 1.0}, {"alpha": 1.5}, {"B1": 0.0}, {"B1": 1e-4, "B0": 0.3})
 
 
 def lanes(cases) -> dict[str, np.ndarray]:
@@ -113,9 +113,7 @@ def test_sweeps_of_table_1(swept):
     np.testing.assert_array_equal(swept["u_max"][:, 0, 0] - swept["u_max"][:, 1, 0] > 1e-9, between)
     # The period doubles at 0.44; a basis without subharmonics can report the instability, but has no such motion.
     assert swept["stability"][1, 0, 0] == 1
-    assert (swept["outcome"][:, 0] == 0).all()
-    # Every sweep is balanced; the branch of alpha = 0 may be too long, which sets TOLERANCE_NOT_MET.
-    assert (swept["outcome"] <= 1).all()
+    assert (swept["outcome"] == 0).all()
 
 
 def test_branch_passes_the_folds(swept):
@@ -165,12 +163,12 @@ def test_branch_passes_contacts_that_come_and_go(begin, end):
 
 
 def test_linear_limits_are_exact(swept):
-    for lane in (1, 2, 6):
+    for lane in (1, 2, 5):
         values = TABLE1 | CASES[lane]
         amplitude = (swept["u_max"] - swept["u_min"])[..., lane] / 2
         np.testing.assert_allclose(amplitude, np.stack([linear(values, OMEGAS)] * 2, axis=1), rtol=1e-10)
         np.testing.assert_allclose(swept["residual"][..., lane], 0, atol=1e-12)
-    np.testing.assert_allclose(swept["u_max"][..., 5], swept["u_min"][..., 5], rtol=1e-12)
+    np.testing.assert_allclose(swept["u_max"][..., 4], swept["u_min"][..., 4], rtol=1e-12)
 
 
 @pytest.mark.full
