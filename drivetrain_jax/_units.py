@@ -29,7 +29,12 @@ _UNITS = (
     *(f"gon = {math.pi / 200!r} radian", f"turn = {2 * math.pi!r} radian = _ = rev = revolution = cycle"),
     *("rpm = turn / minute", "rps = turn / second", "cpm = turn / minute", "hertz = turn / second = Hz"),
     *("newton = kilogram * meter / second ** 2 = N", "kilogram_force = 9.80665 newton = kgf = kp"),
-    *("pound_force = 4.4482216152605 newton = lbf", "joule = newton * meter = J", "watt = joule / second = W"),
+    *(
+        "pound_force = 4.4482216152605 newton = lbf",
+        "slug = pound_force * second ** 2 / foot = slugs",
+        "joule = newton * meter = J",
+        "watt = joule / second = W",
+    ),
     *("pascal = newton / meter ** 2 = Pa", "bar = 1e5 pascal", "psi = pound_force / inch ** 2"),
     "percent = 0.01",
 )
@@ -40,6 +45,8 @@ _SPELLINGS = (
     # A degree to some and 1/400 of a turn to others; a giga-radian to pint.
     (re.compile(r"\b[Gg]rad\b"), "?"),
     (re.compile(r"\bRPM\b"), "rpm"),
+    # An inertia in inches: the pound is one of force.
+    (re.compile(r"\blb(?=[ *·.-]*(?:in|ft)[ *·.-]*s(?:2|\^2|\*\*2|²))"), "lbf"),
     # kNm, Nmm, Ns, Nms and kgm2 are products; a prefix stays with its own unit.
     (re.compile(r"\b([kM]?N)(m?m)(s?)\b"), lambda found: "*".join(filter(None, found.groups()))),
     (re.compile(r"\b([kM]?N)s\b"), r"\1*s"),
@@ -64,7 +71,10 @@ def misread(text: str) -> str:
     """A remark on what a text that is no number with a unit was meant to be; empty without a guess."""
     plain = text.replace(" ", "")
     if comma := re.match(r"[+-]?\d+,\d+(?![\d,.])", plain):
-        return f" (did you mean {comma[0].replace(',', '.')}?)"
+        thousands = comma[0].replace(",", "") + " or " if re.fullmatch(r"[+-]?[1-9]\d{0,2},\d{3}", comma[0]) else ""
+        return f" (did you mean {thousands}{comma[0].replace(',', '.')}?)"
+    if re.match(r"[+-]?[1-9]\d{0,2}(,\d{3}){2,}(?![\d,])", plain):
+        return " (write digits without commas)"
     if quotient := re.fullmatch(r"([\d.]+)/([\d.]+)", plain):
         return f" (a quotient is written as a number: {float(quotient[1]) / float(quotient[2]):.10g})"
     return " (a range, where one number is needed)" if re.fullmatch(r"[^:]+:[^:]+", plain) else ""

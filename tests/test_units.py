@@ -13,7 +13,7 @@ import xarray as xr
 
 import drivetrain_jax as dt
 from drivetrain_jax._quantities import Parameter
-from drivetrain_jax._units import UnitError, number
+from drivetrain_jax._units import UnitError, misread, number
 from drivetrain_jax.runs.scene import load_scene
 
 BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
@@ -40,10 +40,27 @@ BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
         ("2 %", "1", 0.02),
         ("inf N/m", "N/m", math.inf),
         ("1 lbf in", "N m", 4.4482216152605 * 0.0254),
+        ("1 slug ft2", "kg m2", 4.4482216152605 * 0.3048),
+        ("1 lb in s2", "kg m2", 4.4482216152605 * 0.0254),
+        ("1 lb ft2", "kg m2", 0.45359237 * 0.3048**2),
     ],
 )
 def test_numbers(text, units, value):
     assert number(text, units) == pytest.approx(value, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "remark"),
+    [
+        ("1,425 rpm", "did you mean 1425 or 1.425?"),
+        ("12,5 mm", "did you mean 12.5?"),
+        ("0,425 mm", "did you mean 0.425?"),
+        ("1,425,000 N", "write digits without commas"),
+    ],
+)
+def test_a_comma_is_explained(text, remark):
+    """Three digits after a comma are thousands to some and thousandths to others, so none is assumed."""
+    assert misread(text) == f" ({remark})"
 
 
 @pytest.mark.parametrize(
