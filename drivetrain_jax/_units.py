@@ -29,13 +29,9 @@ _UNITS = (
     *(f"gon = {math.pi / 200!r} radian", f"turn = {2 * math.pi!r} radian = _ = rev = revolution = cycle"),
     *("rpm = turn / minute", "rps = turn / second", "cpm = turn / minute", "hertz = turn / second = Hz"),
     *("newton = kilogram * meter / second ** 2 = N", "kilogram_force = 9.80665 newton = kgf = kp"),
-    *(
-        "pound_force = 4.4482216152605 newton = lbf",
-        "slug = pound_force * second ** 2 / foot = slugs",
-        "joule = newton * meter = J",
-        "watt = joule / second = W",
-    ),
+    *("pound_force = 4.4482216152605 newton = lbf", "joule = newton * meter = J", "watt = joule / second = W"),
     *("pascal = newton / meter ** 2 = Pa", "bar = 1e5 pascal", "psi = pound_force / inch ** 2"),
+    "slug = pound_force * second ** 2 / foot = slugs",
     "percent = 0.01",
 )
 # Spellings that would be read as other units, or not at all.

@@ -11,6 +11,7 @@ xi points radially outwards, eta tangentially. All functions broadcast over para
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
@@ -30,8 +31,12 @@ from drivetrain_jax.systems.planetary_units import PHYSICAL
 
 
 def check(fixed: Mapping[str, Any]) -> None:
-    """Raise ``ValueError`` unless all lists have the same length, one entry per planet."""
+    """Raise ``ValueError`` unless all lists have the same length, one entry per planet; warn of planets in one place."""
     angles = fixed.get("planet_angle")
+    if angles is not None and all(isinstance(angle, (int, float)) for angle in angles):
+        apart = [math.remainder(a - b, 2 * math.pi) for i, a in enumerate(angles) for b in angles[:i]]
+        if any(abs(gap) < 1e-9 for gap in apart):
+            warnings.warn(f"planet_angle = {list(angles)}: several planets are in one place", stacklevel=2)
     for name in (*PER_PLANET, *ERRORS):
         value = fixed.get(name)
         if isinstance(value, tuple) and angles is not None and len(value) != len(angles):

@@ -47,6 +47,12 @@ def test_lists_have_one_entry_per_planet():
 
 
 @pytest.mark.full
+@pytest.mark.parametrize("angles", [(0.0, 0.0, 2.0), (0.5, 2.0, 0.5 - 2 * math.pi)])
+def test_planets_in_one_place_are_warned_of(angles):
+    with pytest.warns(UserWarning, match=r"^planet_angle = \[.*\]: several planets are in one place$"):
+        load_scene(SCENE | {"fixed": {"planet_angle": list(angles)}})
+
+
 def test_rotations_of_four_planets():
     """Four frequencies are distinct, and the frequency of planets alone is triple: (39), (40)."""
     found = dt.modes(dt.Planetary(model="rotational"), outputs=EVERYTHING)
