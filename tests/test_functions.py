@@ -357,6 +357,7 @@ assert found.dtype == "float64" and abs(found - 1.0319354931451954) < 1e-9, foun
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+@pytest.mark.full
 def test_who_embeds_the_package_may_keep_single_precision():
     code = """
 import os

@@ -122,6 +122,7 @@ def test_a_sweep_takes_units():
     assert doubled.beta.values.tolist() == [math.radians(9), 0.1]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "bring",
     [

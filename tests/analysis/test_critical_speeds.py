@@ -322,10 +322,12 @@ def check_differences(p: np.ndarray, rows: Mapping[str, np.ndarray], arguments: 
     np.testing.assert_allclose(rows["k"][:, ABSENT], one_sided, rtol=1e-5)
 
 
+@pytest.mark.full
 def test_gradients_obey_the_sum_identities(jacobians):
     check_identities(*jacobians, ARGUMENTS)
 
 
+@pytest.mark.full
 def test_gradients_against_finite_differences(jacobians):
     check_differences(*jacobians, ARGUMENTS)
 

@@ -152,6 +152,7 @@ def test_count_steps_by_one_at_every_frequency():
         assert np.all(above - below == 1) and np.all(np.diff(below) == 1), name
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("large", full_after(1, [1e100, 1e30, 1e12]))
 def test_limits_are_reached(large):
     """A stiff rotational spring clamps. A large inertia does so as well, apart from its own low frequency."""

@@ -24,7 +24,7 @@ from tests.sizes import full_after
 TABLE1 = PRESETS["table1"]
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "rattle.json").read_text())
 STEADY = {case["name"]: case for case in REFERENCE["steady"]}
-OMEGAS = np.array([0.35, 0.44, 0.6, 0.7, 0.755, 0.8, 0.84, 0.87, 0.9, 1.0])
+OMEGAS = np.array([0.44, 0.6, 0.7, 0.755, 0.8, 0.87, 1.0])
 OUTPUTS = ("u_max", "u_min", "u_rms", "phase", "stability", "spectral_radius", "residual", "regime",
            "branch_u_max", "branch_u_min", "branch_stability")  # fmt: skip
 # Table 1, then b = 0, alpha = 1, alpha > 1, no drive, no separation.
@@ -102,8 +102,8 @@ def test_stability_is_that_of_the_exact_motion():
 
 def test_sweeps_of_table_1(swept):
     for name, row, direction in (
-        ("T1 w.7 double-sided", 3, 0), ("T1 w.8 high", 5, 0), ("T1 w.8 low", 5, 1),
-        ("T1 w1.0", 9, 0), ("T1 w.6 single-sided", 2, 1),
+        ("T1 w.7 double-sided", 2, 0), ("T1 w.8 high", 4, 0), ("T1 w.8 low", 4, 1),
+        ("T1 w1.0", 6, 0), ("T1 w.6 single-sided", 1, 1),
     ):  # fmt: skip
         case = STEADY[name]
         ours = [swept[key][row, direction, 0] for key in ("u_max", "u_min", "u_rms", "phase")]
@@ -112,7 +112,7 @@ def test_sweeps_of_table_1(swept):
     between = (OMEGAS > 0.7539) & (OMEGAS < 0.8743)
     np.testing.assert_array_equal(swept["u_max"][:, 0, 0] - swept["u_max"][:, 1, 0] > 1e-9, between)
     # The period doubles at 0.44; a basis without subharmonics can report the instability, but has no such motion.
-    assert swept["stability"][1, 0, 0] == 1
+    assert swept["stability"][0, 0, 0] == 1
     assert (swept["outcome"] == 0).all()
 
 

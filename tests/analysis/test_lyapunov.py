@@ -448,6 +448,7 @@ class TestPaperEstimator:
         """Reference: RK4 by an independent author. The largest of all three is negative, so that criterion (37) fails."""
         np.testing.assert_allclose(by_the_paper("input", 0.0016, strobes), expected, rtol=0, atol=5.1e-3)
 
+    @pytest.mark.full
     @pytest.mark.parametrize("element", full_after(1, ["input", "output"]))
     def test_it_is_the_rule_by_scipy(self, element):
         equation, frequency, chi_n = ("29", 3066.5, 0.0026) if element == "input" else ("30", 2792.0, 0.0027)

@@ -51,6 +51,7 @@ class InTurns(InSeconds):
         return FloquetModel(form, form)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("damping", full_after(1, [0.1, 40.0]))
 @pytest.mark.parametrize("method", full_after(1, ["direct", "diffrax"]))
 def test_both_clocks_have_the_same_multipliers(method, damping):

@@ -87,6 +87,7 @@ def direct_tip(beta, omega, shift=1e-5, narrowed=4, **others):
     return beta, omega
 
 
+@pytest.mark.full
 def test_all_twelve_tips_and_no_other(tips):
     assert tips.undecided == ()
     assert [tip.name for tip in tips.tips] == list(TIPS)
@@ -242,6 +243,7 @@ def test_roots_on_a_line_are_all_sign_changes(atlas):
         assert np.all((found.x >= x[changes, 1]) & (found.x <= x[changes + 1, 1]))
 
 
+@pytest.mark.full
 def test_boundary_curves_are_boundaries(atlas, curves):
     criteria = Criteria.of(atlas, CARDAN)
     lowest = []

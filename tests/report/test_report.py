@@ -168,6 +168,7 @@ def test_the_report_compares_the_forced_motion_with_a_limit(truck):
     assert "within the limit of 1.57 rad." in " ".join(Page(report(truck[1:], amplitude=1.57)).words)
 
 
+@pytest.mark.full
 def test_the_report_compares_the_forced_motion_of_a_stability_result(truck):
     stable, amplitude = truck[0], np.rad2deg(dt.open_result(truck[1]).amplitude.values)
     text = _plain(" ".join(Page(report([stable], amplitude="2 deg")).words))

@@ -359,6 +359,7 @@ def test_nothing_found_beside_undecided_ranges_is_not_nothing(monkeypatch):
     assert str(reply).splitlines()[2] == "  undecided from Omega = 0.5 to Omega = 0.6"
 
 
+@pytest.mark.full
 def test_windows_name_the_kinds_of_their_ends():
     found = atlas_answers.speed_windows(atlas_of((0.0, 1.3), (0.15, 2.0), rtol=1e-5), {"beta": 0.894981})
     windows = json.loads(found.to_json())["windows"]

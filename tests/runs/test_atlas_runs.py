@@ -170,7 +170,7 @@ def interrupted_run(scene, out, reports):
 
 @pytest.mark.parametrize(
     ("scene", "chunks"),
-    full_after(2, [(ATLAS, 1), (AT_ONE_SPEED, 1), (AT_ONE_SPEED, 3), (AT_ONE_SPEED, 6)], several=True),
+    full_after(1, [(ATLAS, 1), (AT_ONE_SPEED, 1), (AT_ONE_SPEED, 3), (AT_ONE_SPEED, 6)], several=True),
 )
 def test_an_interrupted_atlas_is_resumed_with_the_same_bits(tmp_path, scene, chunks):
     """The interrupt is in the only round of solves, or in the first or a later round of an atlas with solved nodes."""
@@ -246,6 +246,7 @@ def test_single_points_empty_arrays_and_wrong_shapes(atlas):
     assert np.isfinite(row).all() and (row == row[:, :1]).all()
 
 
+@pytest.mark.full
 def test_an_atlas_of_another_range_is_refused(tmp_path):
     run_to_file(ATLAS, tmp_path / "a.nc")
     with pytest.raises(dt.InputError, match=r"axes.beta has the range from 0 to 0\.5, had the range from 0 to 0\.6;"):

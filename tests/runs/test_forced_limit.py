@@ -79,6 +79,7 @@ def test_what_is_not_known_is_not_within_a_limit(amplitude, verdict, within, tex
     assert json.loads(json.dumps(data, allow_nan=False)) == data
 
 
+@pytest.mark.full
 def test_limits_that_mean_nothing_are_refused(capsys):
     for words, message in (
         ([*WORDS, "speed=2000", "--amplitude", "2"], 'did you mean "2 deg"?'),

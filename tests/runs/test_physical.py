@@ -216,6 +216,7 @@ def test_a_length_that_looks_like_millimetres_is_warned_of():
         dt.Bicardan(length=[0.3, 900], EI=[1e4, 1e4], rhoA=[15, 15], k_A=1e6, k_D=1e6)
 
 
+@pytest.mark.full
 def test_teeth_give_orders_and_phases():
     found = dt.run(
         {"system": "planetary", "analysis": "modes", "fixed": {"teeth": [20, 26, 72]}, "axes": {"k_sp": [5e8]}}

@@ -60,6 +60,7 @@ def test_sensitivities_of_the_radius_are_sorted_and_physical(atlas):
     assert "largest effect of 1 % first" in str(found)
 
 
+@pytest.mark.full
 def test_without_physical_data_the_parameters_are_sorted():
     fixed = {"beta": 0.3, "zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
     scene = {"system": "cardan", "analysis": "atlas", "fixed": fixed, "axes": {"Omega": {"start": 1.4, "stop": 1.43}}}
