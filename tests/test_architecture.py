@@ -72,29 +72,12 @@ def test_no_files_import_each_other():
     assert [cycle for cycle in cycles if len(cycle) > 1] == []
 
 
-def modules(*folders: str) -> list[str]:
-    """Names of all modules in these folders of the package."""
-    files = (file for folder in folders for file in sorted((ROOT / "drivetrain_jax" / folder).rglob("*.py")))
-    return [".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for file in files]
-
-
 HEAVY = ("jax", "numpy", "scipy", "xarray", "diffrax", "matplotlib", "h5py")
 
 
 @pytest.mark.parametrize("module", ["drivetrain_jax", "drivetrain_jax.cli"])
 def test_import_is_light(module):
     assert python(f"import sys, {module}; print(sorted(set({HEAVY}) & set(sys.modules)))") == "[]"
-
-
-@pytest.mark.parametrize("folder", ["store", "view", "invariants"])
-def test_folder_does_without_jax(folder):
-    assert python(f"import sys, {', '.join(modules(folder))}; print('jax' in sys.modules)") == "False"
-
-
-def test_figures_and_rules_do_without_jax():
-    names = [name for name in modules("analysis") if name.endswith((".figure", ".rules"))]
-    assert len(names) > 20
-    assert python(f"import sys, {', '.join(names)}; print('jax' in sys.modules)") == "False"
 
 
 def scenes() -> dict[tuple[str, str], dict]:

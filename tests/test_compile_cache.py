@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.sizes import full_after
+
 SWEEP = """
 from drivetrain_jax import _compile_cache
 import jax
@@ -52,7 +54,7 @@ def test_compiled_code_is_kept_in_a_private_folder(tmp_path):
     assert stat.S_IMODE(os.stat(folder).st_mode) == 0o700
 
 
-@pytest.mark.parametrize("setting", ["0", "a file"])
+@pytest.mark.parametrize("setting", full_after(1, ["0", "a file"]))
 def test_cache_is_off_by_setting_or_without_a_folder(tmp_path, setting):
     if setting == "a file":
         (tmp_path / "file").touch()
@@ -81,6 +83,7 @@ def test_calls_leave_a_cache_of_the_user_and_short_programs_alone(tmp_path):
     assert not any("tiny" in name for name in os.listdir(folder))
 
 
+@pytest.mark.full
 def test_entries_used_longest_ago_and_entries_without_a_date_are_removed(tmp_path):
     folder = Path(folder_used(SWEEP, XDG_CACHE_HOME=str(tmp_path)))
     for n in range(1001):

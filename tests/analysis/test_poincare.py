@@ -62,6 +62,7 @@ def test_few_strobes_that_do_not_repeat_tell_nothing_of_chaos():
     assert found[0][0] == 0 and abs(found[1][1]) < 0.1
 
 
+@pytest.mark.full
 def test_section_repeats_exactly():
     points = section(["section"], strobes=128, discard=500, steps=24).section.values[0]
     assert np.abs(points[10:] - points[:-10]).max() < 1e-9 * np.abs(points).max()

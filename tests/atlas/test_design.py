@@ -173,6 +173,7 @@ def test_a_check_refutes_an_error_that_is_too_small(atlas, monkeypatch, beyond, 
     assert widest_angle(atlas, CARDAN, (1.3, 1.5), {}, direct=direct).check.agrees == agrees
 
 
+@pytest.mark.full
 def test_a_check_follows_the_ridge_of_a_narrow_tongue():
     """With very little damping the error covers an undecided range; at its end the tongue is not at the speed of its tip."""
     fixed = {"zeta": 1.0165e-5, "alpha": 0.13975, "mu": 1.0822, "gamma": 1.09888}

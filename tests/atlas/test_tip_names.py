@@ -67,6 +67,7 @@ def test_orders_suffice_for_every_resonance_of_an_atlas(stiffnesses):
     assert naming._name(wide, CARDAN, "-1", wide.to_coordinates(np.array([20.0, speed]))) == "S217"
 
 
+@pytest.mark.full
 def test_each_tongue_over_the_stiffness_ratio_has_one_curve(stiffnesses):
     """A curve runs from rim to rim through its tip, and seeds on the rim are recognised as its ends."""
     curves = boundaries(stiffnesses, CARDAN)

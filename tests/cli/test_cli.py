@@ -553,7 +553,7 @@ _RULES = "from drivetrain_jax.invariants import Declared, Rule\n"
         ("rules", f"{_RULES}X = Declared(Rule('r', (), len))", "bad:X cannot be loaded: TypeError: rules: got Rule"),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("foreign", full_after(3, [False, True]))
+@pytest.mark.parametrize("foreign", full_after(1, [False, True]))
 def test_a_figure_or_rule_that_fails_is_named(cli, install, group, code, wanted, foreign):
     install({"bad": code}, **{group: ["toy = bad:X"]})
     cli("run", "scene.toml", "--out", "r.nc", "--quiet")

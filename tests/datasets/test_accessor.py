@@ -20,6 +20,7 @@ from drivetrain_jax.datasets.resonances import BUILT_IN
 from drivetrain_jax.systems import get_system, system_names
 from drivetrain_jax.view.style import caption
 from tests.atlases import atlas_file
+from tests.sizes import full_after
 
 SHAFT = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 CHART = {
@@ -54,12 +55,15 @@ def captions(figure):
 
 @pytest.mark.parametrize(
     "lines",
-    [
-        ["import drivetrain_jax", "import xarray as xr"],
-        ["import xarray as xr", "import drivetrain_jax"],
-        ["import drivetrain_jax, sys", "assert 'xarray' not in sys.modules", "from xarray import Dataset"],
-        ["import xarray as xr", "xr.backends.list_engines()"],
-    ],
+    full_after(
+        1,
+        [
+            ["import drivetrain_jax", "import xarray as xr"],
+            ["import xarray as xr", "import drivetrain_jax"],
+            ["import drivetrain_jax, sys", "assert 'xarray' not in sys.modules", "from xarray import Dataset"],
+            ["import xarray as xr", "xr.backends.list_engines()"],
+        ],
+    ),
 )
 def test_every_dataset_has_the_accessor(lines):
     check = ["import sys, xarray", "assert xarray.Dataset.drivetrain.named", "assert 'jax' not in sys.modules"]

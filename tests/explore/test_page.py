@@ -43,6 +43,7 @@ def texts(page, fragment=""):
     return json.loads(done.stdout)
 
 
+@pytest.mark.full
 @needs_node
 def test_a_copied_scene_is_the_visible_chart(atlases, two):
     told = texts(two, "view.Omega=1.2:1.6&view.beta=0.1:0.7")
@@ -168,6 +169,7 @@ def test_damaged_and_foreign_files_are_refused_in_one_line(atlases, tmp_path, ca
         assert error.startswith("drivetrain: ") and error.count("\n") == 1 and not out.exists()
 
 
+@pytest.mark.full
 def test_a_notebook_shows_the_page(atlases):
     atlas = atlases("two")
     with xr.open_dataset(atlases.folder / "two.nc", engine="h5netcdf") as dataset:

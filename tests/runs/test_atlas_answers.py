@@ -374,6 +374,7 @@ def test_windows_name_the_kinds_of_their_ends():
     assert "largest spectral radius 1 - " in str(found) and "largest spectral radius 1 at" not in str(found)
 
 
+@pytest.mark.full
 def test_answers_without_damping_agree_with_direct_solves():
     atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
     assert atlas_answers.widest_angle(atlas, {"Omega": (1.6, 1.9)}).data["check"]["agrees"]

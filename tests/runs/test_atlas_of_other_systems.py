@@ -71,6 +71,7 @@ def test_values_may_have_units(atlas):
     assert np.array_equal(grid.spectral_radius, two.spectral_radius)
 
 
+@pytest.mark.full
 def test_a_grid_of_the_engine_may_have_units(tmp_path):
     dt.run(SCENE, out=tmp_path / "a.nc")
     found = xr.open_dataset(tmp_path / "a.nc", engine="drivetrain", grid={"omega": ("0.14 Hz", "0.16 Hz", 3)})

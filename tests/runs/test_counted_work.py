@@ -161,6 +161,7 @@ def test_shafts(monkeypatch, tally, compilations, tmp_path):
     assert not compilations, "a second run compiles again"
 
 
+@pytest.mark.full
 def test_sweeps_of_gears(monkeypatch, tally):
     plain = singular_values._sweep
 

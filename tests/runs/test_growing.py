@@ -16,6 +16,7 @@ from drivetrain_jax.runs.growing import _positions
 from drivetrain_jax.runs.run import Interrupted, run_to_file
 from drivetrain_jax.runs.status import status
 from drivetrain_jax.store import checksums
+from tests.sizes import full_after
 
 NAMES = ["value", "wave", "sign"]
 
@@ -49,14 +50,18 @@ SMALL = scene({"b": [1.0, 3.0], "a": {"start": 0.0, "stop": 10.0, "num": 11}})
 
 @pytest.mark.parametrize(
     ("large", "new"),
-    [
-        (scene({"b": [1.0, 3.0, 2.0], "a": {"start": 0.0, "stop": 10.0, "num": 11}}), 11),
-        (scene({"b": [1.0, 3.0], "a": {"start": 0.0, "stop": 10.0, "num": 21}}), 20),
-        (scene({"b": [1.0, 3.0], "a": {"start": 0.0, "stop": 10.0, "num": 31}}), 40),
-        (scene({"a": {"start": 0.0, "stop": 10.0, "num": 11}, "b": [3.0, 1.0]}), 0),
-        (scene(SMALL["axes"] | {"n": [2, 3]}), 22),
-        (scene(SMALL["axes"] | {"unused": [5.0]}), 0),
-    ],
+    full_after(
+        3,
+        [
+            (scene({"b": [1.0, 3.0, 2.0], "a": {"start": 0.0, "stop": 10.0, "num": 11}}), 11),
+            (scene({"b": [1.0, 3.0], "a": {"start": 0.0, "stop": 10.0, "num": 21}}), 20),
+            (scene({"b": [1.0, 3.0], "a": {"start": 0.0, "stop": 10.0, "num": 31}}), 40),
+            (scene({"a": {"start": 0.0, "stop": 10.0, "num": 11}, "b": [3.0, 1.0]}), 0),
+            (scene(SMALL["axes"] | {"n": [2, 3]}), 22),
+            (scene(SMALL["axes"] | {"unused": [5.0]}), 0),
+        ],
+        several=True,
+    ),
     ids=["longer", "finer", "finer by three", "other order", "one more axis", "an axis that is not used"],
 )
 def test_only_new_points_are_computed(tmp_path, large, new):
@@ -331,12 +336,15 @@ def turned(path, **changes):
 
 @pytest.mark.parametrize(
     "change",
-    [
-        {"a": slice(None, None, -1)},
-        {"a": slice(0, 5)},
-        {"part": slice(None, None, -1)},
-        {"b": 0},
-    ],
+    full_after(
+        2,
+        [
+            {"a": slice(None, None, -1)},
+            {"a": slice(0, 5)},
+            {"part": slice(None, None, -1)},
+            {"b": 0},
+        ],
+    ),
     ids=["mirrored", "cut", "mirrored results", "one value"],
 )
 def test_a_rearranged_copy_is_neither_reused_nor_complete(tmp_path, change):

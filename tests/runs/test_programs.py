@@ -79,6 +79,7 @@ def test_a_damaged_program_is_replaced(tmp_path, damage):
     assert lines(POINT, tmp_path) == first and lines(POINT, tmp_path) == [*first[:-1], "0"]
 
 
+@pytest.mark.full
 def test_a_program_that_calls_python_is_not_stored(tmp_path):
     assert lines(CALLBACK, tmp_path) == ["[1.", "1.", "1.]"] and stored(tmp_path) == []
 

@@ -28,6 +28,7 @@ from drivetrain_jax.runs.executor import Threads
 from drivetrain_jax.runs.run import Incomplete, run_to_file
 from drivetrain_jax.runs.status import status
 from drivetrain_jax.store.chunks import PartsFolder
+from tests.sizes import full_after
 
 
 def expected_value(a, b, n=3, length=(1.0, 2.0, 3.0)):
@@ -601,7 +602,7 @@ def test_killed_and_resumed_equals_uninterrupted(slow_process, tmp_path):
     assert_same(xr.open_dataset(out, engine="h5netcdf"), xr.open_dataset(reference, engine="h5netcdf"))
 
 
-@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("sent", full_after(1, [signal.SIGINT, signal.SIGTERM]))
 def test_signal_stops_promptly_and_loses_nothing(slow_process, sent):
     start, out = slow_process
     process = start()
@@ -615,6 +616,7 @@ def test_signal_stops_promptly_and_loses_nothing(slow_process, sent):
     assert 0 < found.done < 400 and "Traceback" not in stderr
 
 
+@pytest.mark.full
 def test_repeated_interrupts_lose_nothing(slow_process):
     """Finished chunks are written after the first interrupt, and further interrupts do not stop this."""
     start, out = slow_process

@@ -441,12 +441,16 @@ def test_unfinished_work_is_opened_and_counted(grid_scene, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "damage"),
-    [
-        (".", lambda file: file.write_text("rubbish")),
-        ("checksums", lambda file: file.write_text("{}")),
-        ("checksums/shards", lambda file: file.unlink()),
-        ("value", lambda file: file.write_text(json.dumps(json.loads(file.read_text()) | {"shape": [1]}))),
-    ],
+    full_after(
+        1,
+        [
+            (".", lambda file: file.write_text("rubbish")),
+            ("checksums", lambda file: file.write_text("{}")),
+            ("checksums/shards", lambda file: file.unlink()),
+            ("value", lambda file: file.write_text(json.dumps(json.loads(file.read_text()) | {"shape": [1]}))),
+        ],
+        several=True,
+    ),
 )
 def test_an_unfinished_store_with_damaged_metadata_is_replaced(grid_scene, tmp_path, name, damage):
     path, scene = tmp_path / "r.zarr", large(grid_scene)

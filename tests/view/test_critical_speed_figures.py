@@ -161,6 +161,7 @@ def test_results_without_a_positive_value_are_refused(swept, value, shown):
         plot(empty.isel(k_D=[0, 1]).expand_dims(k_A=[1.0, 2.0]))
 
 
+@pytest.mark.full
 def test_shapes_are_drawn_over_the_shaft_with_its_points():
     fixed = {"length": [0.3, 1.2, 0.5], "EI": [16.0, 256.0, 1.0], "k_A": 5e6, "k_D": np.inf, "k_joint": [0.0, 2e6]}
     fixed |= {"m_joint": [8.0, 0.0], "k_hinge": [1e5, np.inf], "I_D": 0.1}

@@ -51,6 +51,7 @@ def test_a_rigid_motion_alone_has_no_meeting():
     assert np.isnan(rigid.drivetrain.orders()).all() and np.isfinite(found.drivetrain.orders()[1:]).all()
 
 
+@pytest.mark.full
 def test_joints_meet_a_critical_speed_at_half_of_it(capsys):
     words = [f"{name}={json.dumps(value)}" for name, value in (SHAFT | RANGE).items()]
     assert main(["point", "bicardan", "critical_speeds", "modes=3", *words]) == 0
