@@ -37,6 +37,7 @@ def test_error_lies_within_tolerance_and_bound(atlas):
     assert atlas.solves < 8000
 
 
+@pytest.mark.full
 def test_the_atlas_agrees_with_the_determinant_of_the_paper(atlas):
     """The determinants differ by factors of the supports and a power of the frequency, from the units of the states."""
     phase, k = np.array([1.5, 2.6, 4.1, 5.2]), np.full(4, 2e7)

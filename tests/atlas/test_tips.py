@@ -107,7 +107,8 @@ def test_errors_of_tips_lie_within_their_bounds(tips):
         assert abs(tip.point["Omega"] - omega) <= tip.error["Omega"] + 1e-10
 
 
-@pytest.mark.parametrize("name", full_after(1, ["H22", "C+2"]))
+@pytest.mark.full
+@pytest.mark.parametrize("name", ["H22", "C+2"])
 def test_tips_against_root_finding_on_direct_solves(tips, name):
     tip = next(tip for tip in tips.tips if tip.name == name)
     beta, omega = direct_tip(tip.point["beta"], tip.point["Omega"])
@@ -273,6 +274,7 @@ def test_only_points_on_the_stable_region_are_limiting(chart):
     assert inside > 20
 
 
+@pytest.mark.full
 def test_curves_enclose_the_unstable_region(atlas, curves):
     """Random points are unstable if the path from beta = 0 crosses an odd number of curves."""
     generator = np.random.default_rng(3)

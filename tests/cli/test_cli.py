@@ -473,6 +473,7 @@ def _listed(value):
     return list(value) if isinstance(value, tuple) else value
 
 
+@pytest.mark.full
 def test_titles_that_an_output_cannot_write_are_escaped(folder):
     (folder / "sweeps").mkdir()
     (folder / "sweeps" / "one.toml").write_text('title = "Gelenk für β"\nsystem = "cardan"', "utf-8")
@@ -624,6 +625,7 @@ def test_a_call_from_python_leaves_its_garbage_collector_alone(cli):
     assert cli("list")[0] == 0 and (gc.get_threshold(), gc.get_freeze_count()) == before
 
 
+@pytest.mark.full
 def test_looking_at_a_result_loads_no_integrator_and_no_tables(folder):
     """These packages would take half of the time until a finished result is recognised."""
     scene = Path(__file__).parents[2] / "sweeps" / "quickstart.toml"
@@ -671,6 +673,7 @@ def test_an_output_that_takes_nothing(where, code, said):
     assert (done.returncode, done.stderr) == (code, said)
 
 
+@pytest.mark.full
 def test_a_reader_that_leaves_is_no_error():
     command = f"{sys.executable} -m drivetrain_jax.cli list cardan | true"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)

@@ -196,6 +196,7 @@ def test_an_output_that_points_elsewhere_is_only_that(folder, capsys):
     assert sorted(os.listdir("..")) == ["inner", "r.nc"]
 
 
+@pytest.mark.full
 def test_nothing_is_executed_or_unpickled():
     """No module calls what would run text or bytes that it has read."""
     for path in Path(drivetrain_jax.__file__).parent.rglob("*.py"):

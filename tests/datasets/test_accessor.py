@@ -169,6 +169,7 @@ def test_a_grid_without_end_is_not_drawn(folder):
         xr.open_dataset(folder / "atlas.nc", engine="drivetrain", grid=100_000).drivetrain.plot()
 
 
+@pytest.mark.full
 def test_what_a_part_lacks_is_named(chart):
     with pytest.raises(dt.InputError, match="result: without 'outcome', which its figure needs; allowed is a whole"):
         dt.plot(chart.load().drop_vars("outcome"))
@@ -201,6 +202,7 @@ def test_words_are_not_drawn(chart):
         chart.drivetrain.named().drivetrain.plot()
 
 
+@pytest.mark.full
 def test_a_lazy_grid_is_evaluated_once_for_its_figure(folder, monkeypatch):
     from drivetrain_jax.runs.atlas_file import StoredAtlas
 

@@ -282,6 +282,7 @@ def test_a_file_that_changes_is_not_mixed_with_another(tmp_path, file):
     assert opened(copy)["verdict"].isel(beta=0).values.shape == (400,)
 
 
+@pytest.mark.full
 def test_xarray_knows_the_file_without_an_engine(file, tmp_path):
     assert xr.open_dataset(file)["verdict"].shape == (512, 512)
     knows = xr.backends.list_engines()["drivetrain"].guess_can_open

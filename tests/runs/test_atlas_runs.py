@@ -211,6 +211,7 @@ def test_solves_are_kept_when_a_chart_fails_after_them(tmp_path, monkeypatch):
     assert run_to_file(scene, out).computed == 533
 
 
+@pytest.mark.full
 def test_the_solves_of_an_atlas_run_on_workers(stored, monkeypatch):
     """All solves run on workers, none in this process, and have the same bits as in threads."""
     monkeypatch.setattr(Job, "compute", None)
@@ -541,6 +542,7 @@ def answer(capsys, *arguments):
     return code, captured.out, captured.err
 
 
+@pytest.mark.full
 def test_questions_on_the_command_line(file, capsys):
     code, out, _ = answer(capsys, "query", file, "beta=0.31", "Omega=1.2", "--json")
     assert code == 0 and json.loads(out)["values"]["verdict"] == 0

@@ -132,7 +132,7 @@ def as_file(path):
     )
 
 
-@pytest.mark.parametrize("which", full_after(2, ["grid", "line", "one", "fixed path", "points"]))
+@pytest.mark.parametrize("which", full_after(1, ["grid", "line", "one", "fixed path", "points"]))
 def test_xarray_opens_a_store_as_the_file(grid_scene, tmp_path, which, monkeypatch):
     monkeypatch.setattr(shards, "MOST_POINTS", 50)
     scenes = {"grid": large(grid_scene), "line": LINE, "one": ONE, "fixed path": FIXED_PATH, "points": POINTS}

@@ -35,6 +35,7 @@ def test_an_angle_is_drawn_in_degrees():
     np.testing.assert_array_equal(panel(degrees).get_xlim(), panel(plain).get_xlim())
 
 
+@pytest.mark.full
 def test_a_dimensionless_speed_is_drawn_in_rpm_with_physical_data_only():
     with pytest.raises(InputError, match=r"units = 'rpm': no axis .* allowed are units of rad \(a dimensionless speed"):
         plot(chart(), units="rpm")
