@@ -27,8 +27,8 @@ STEADY = {case["name"]: case for case in REFERENCE["steady"]}
 OMEGAS = np.array([0.44, 0.6, 0.7, 0.755, 0.8, 0.87, 1.0])
 OUTPUTS = ("u_max", "u_min", "u_rms", "phase", "stability", "spectral_radius", "residual", "regime",
            "branch_u_max", "branch_u_min", "branch_stability")  # fmt: skip
-# Table 1, then b = 0, alpha = 1, alpha > 1, no drive, no separation.
-CASES = ({}, {"b": 0.0}, {"alpha": 1.0}, {"alpha": 1.5}, {"B1": 0.0}, {"B1": 1e-4, "B0": 0.3})
+# Table 1, then b = 0, no drive, no separation.
+CASES = ({}, {"b": 0.0}, {"B1": 0.0}, {"B1": 1e-4, "B0": 0.3})
 
 
 def lanes(cases) -> dict[str, np.ndarray]:
@@ -163,12 +163,12 @@ def test_branch_passes_contacts_that_come_and_go(begin, end):
 
 
 def test_linear_limits_are_exact(swept):
-    for lane in (1, 2, 5):
+    for lane in (1, 3):
         values = TABLE1 | CASES[lane]
         amplitude = (swept["u_max"] - swept["u_min"])[..., lane] / 2
         np.testing.assert_allclose(amplitude, np.stack([linear(values, OMEGAS)] * 2, axis=1), rtol=1e-10)
         np.testing.assert_allclose(swept["residual"][..., lane], 0, atol=1e-12)
-    np.testing.assert_allclose(swept["u_max"][..., 4], swept["u_min"][..., 4], rtol=1e-12)
+    np.testing.assert_allclose(swept["u_max"][..., 2], swept["u_min"][..., 2], rtol=1e-12)
 
 
 @pytest.mark.full
