@@ -128,7 +128,7 @@ def test_folds_and_peak_are_at_frequencies_of_a_drive():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("alpha", full_after(2, [0.0, 0.2, 0.1, 0.15, 0.3]))
+@pytest.mark.parametrize("alpha", [0.0, 0.2, 0.1, 0.15, 0.3])
 def test_the_largest_self_consistent_range_is_taken(alpha):
     """The range agrees with a dense scan from large ranges down, also where two ranges nearly merge."""
     for ratio in (0.01, 0.4, 0.55, 0.65, 0.68, 0.69, 0.71, 0.72, 0.8, 0.9, 0.95):
@@ -357,7 +357,7 @@ def test_peak_is_the_largest_amplitude_with_heavy_damping():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("case", full_after(2, [{}, {"alpha": 0.0}, {"alpha": 3.0, "B0": 0.0}, {"B0": 0.3}]))
+@pytest.mark.parametrize("case", [{}, {"alpha": 0.0}, {"alpha": 3.0, "B0": 0.0}, {"B0": 0.3}])
 def test_the_backbone_is_the_largest_free_motion(case):
     """The backbone agrees with a scan of amplitudes; it does not depend on the drive and continues beyond the peak."""
     omegas = np.array([0.3, 0.65, 0.85, 0.9, 0.99, 0.99999, 1.3])

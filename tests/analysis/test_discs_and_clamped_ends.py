@@ -101,7 +101,7 @@ def exact_frequency(v: Mapping, p: float) -> mp.mpf:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", full_after(4, CASES))
+@pytest.mark.parametrize("name", CASES)
 def test_discs_springs_and_segments_without_mass(name):
     """Finite elements give the number of frequencies and their values, transfer matrices in 120 digits their digits."""
     values = CASES[name]
@@ -153,7 +153,7 @@ def test_count_steps_by_one_at_every_frequency():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("large", full_after(1, [1e100, 1e30, 1e12]))
+@pytest.mark.parametrize("large", [1e100, 1e30, 1e12])
 def test_limits_are_reached(large):
     """A stiff rotational spring clamps. A large inertia does so as well, apart from its own low frequency."""
     clamped = solve(everything(SHAFT | {"k_rot_A": INF, "k_D": INF, "k_rot_D": INF}))[0]

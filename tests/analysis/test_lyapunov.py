@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import flows
 import jax
@@ -25,9 +23,8 @@ from drivetrain_jax.analysis.lyapunov.verdict import Verdict
 from drivetrain_jax.invariants import check
 from drivetrain_jax.systems import Flow, get_system
 from tests.oracles import tripod_reference as oracle
-from tests.sizes import but_full, full_after
+from tests.sizes import but_full
 
-REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "tripod.json").read_text())
 OUTPUTS = ("lyapunov_spectrum", "lyapunov_standard_error", "sum_rule_residual", "verdict", "chaos_k01")
 LANES = 32
 LITERATURE = {
@@ -449,7 +446,7 @@ class TestPaperEstimator:
         np.testing.assert_allclose(by_the_paper("input", 0.0016, strobes), expected, rtol=0, atol=5.1e-3)
 
     @pytest.mark.full
-    @pytest.mark.parametrize("element", full_after(1, ["input", "output"]))
+    @pytest.mark.parametrize("element", ["input", "output"])
     def test_it_is_the_rule_by_scipy(self, element):
         equation, frequency, chi_n = ("29", 3066.5, 0.0026) if element == "input" else ("30", 2792.0, 0.0027)
         expected = oracle.paper_estimator(equation, 0.0064, chi_n, frequency, 12)

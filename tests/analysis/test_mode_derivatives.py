@@ -115,7 +115,6 @@ def test_turning_the_gear_changes_nothing(jacobian, frequencies):
 
 
 @pytest.mark.full
-@pytest.mark.full
 def test_only_a_parameter_splitting_a_doublet_has_no_derivative():
     """With equal spacing the common bearing of planets keeps the translational doublets; an angle splits all six."""
     rows, f = reversed_jacobian(dt.Planetary(**EQUAL))

@@ -19,7 +19,6 @@ from drivetrain_jax.resonances.cardan import natural_frequencies
 from drivetrain_jax.runs.atlas_answers import radius_gradient
 from tests.oracles.atlas_direct import BASE, CARDAN, cardan_atlas, monodromy, propagators
 from tests.oracles.cardan_reference import monodromy as reference_monodromy
-from tests.sizes import full_after
 
 # beta and Omega of the tips by root finding on direct solves (`direct_tip` below, at rtol 1e-14). For C-1, where two
 # multipliers nearly coincide, the values have 30 digits (tests.oracles.cardan_precise_reference).
@@ -351,7 +350,7 @@ def test_gradients_of_the_radius():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(("inside", "exists"), full_after(1, [(1e-15, False), (1e-10, True)], several=True))
+@pytest.mark.parametrize(("inside", "exists"), [(1e-15, False), (1e-10, True)])
 def test_gradient_at_multipliers_equal_to_rounding(inside, exists):
     """Near the edge of S21 without damping, known to 30 digits, d rho/d Omega = 0.20180 (Omega - edge)^(-1/2)."""
     edge = 1.4001277838891882126

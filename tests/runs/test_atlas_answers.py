@@ -295,7 +295,7 @@ def test_stable_intervals_away_from_the_safe_end_are_listed():
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("speeds", "kind", "value"),
-    full_after(1, [((1.3, 1.5), "crossing", S21[0]), ((1.415, 1.417), "undecided", 0.1062824374)], several=True),
+    [((1.3, 1.5), "crossing", S21[0]), ((1.415, 1.417), "undecided", 0.1062824374)],
 )
 def test_an_answer_names_the_kinds_of_its_ends(speeds, kind, value):
     """On a loose atlas the tip of S21 is undecided from .10628 to .10640, in a narrow range of speeds to .11255."""

@@ -28,7 +28,6 @@ from tests.atlases import atlas_file
 from tests.sizes import full_after
 
 BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
-ENDS = " allowed is start and stop"
 BETA, OMEGA = (0.0, 0.6), (1.0, 2.0)
 ATLAS = {
     "system": "cardan",
@@ -267,7 +266,7 @@ def test_labelled_arrays_keep_their_labels_and_must_agree(atlas):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("outputs", full_after(1, [["floquet_multiplier", "verdict"], ["spectral_radius"]]))
+@pytest.mark.parametrize("outputs", [["floquet_multiplier", "verdict"], ["spectral_radius"]])
 def test_an_atlas_without_a_panel_has_all_its_points_solved(monkeypatch, tmp_path, outputs):
     monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
     scene = floquet("atlas") | {"outputs": outputs}
