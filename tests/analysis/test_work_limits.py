@@ -55,13 +55,13 @@ def assert_ends(name: str, decades: float, count: int, seed: int = 0) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", but_full(CASES, "lyapunov", "poincare", "adaptive section", "forced"))
+@pytest.mark.parametrize("name", CASES)
 def test_the_widest_points_end(name):
     assert_ends(name, 300, FEW)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("decades", [3, 10, 300])
+@pytest.mark.parametrize("decades", [3, 300])
 @pytest.mark.parametrize("name", CASES)
 def test_wide_batches_end(name, decades):
     assert_ends(name, decades, MANY, seed=1)
