@@ -46,7 +46,9 @@ def commands(folder: Path, turn: int) -> dict[str, list[list[str]]]:
     """The commands of every line in this turn; ``turn`` changes their values."""
     shaft = [f"{name}={value}" for name, value in (BASE_CASE | {"beta": 0.3 + 0.01 * turn, "Omega": 1.2}).items()]
     atlas = str(folder / "atlas.nc")
-    chart, response, first = (str(folder / f"{name}{turn}.nc") for name in ("chart", "response", "first"))
+    chart, response, first, tongues = (
+        str(folder / f"{name}{turn}.nc") for name in ("chart", "response", "first", "tongues")
+    )
     quickstart, gears = (_changed(folder, turn, *change) for change in _CHANGES)
     return {
         "point, stability": [["point", "cardan", "floquet", *shaft]],
@@ -57,7 +59,8 @@ def commands(folder: Path, turn: int) -> dict[str, list[list[str]]]:
         "run of a rattle response": [["run", gears, "--out", response]],
         "make atlas": [
             ["run", str(SCENES / "quickstart.toml"), "--out", first],
-            ["plot", first, "--out", str(folder / f"first{turn}.png")],
+            ["run", str(SCENES / "quickstart_atlas.toml"), "--out", tongues],
+            ["plot", first, tongues, "--out", str(folder / f"first{turn}.png")],
         ],
     }
 

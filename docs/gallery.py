@@ -43,11 +43,14 @@ PARTS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
         "Stiffness of the driven shaft over speed, four-parameter atlas": {"beta": 0.5235987755982988, "alpha": 1.0},
     }
 }
+# Charts in the range of an atlas, whose boundaries and tips are drawn over their cells: scene of the chart -> of the atlas.
+TRACED = dict.fromkeys(("quickstart", "cardan_fig2b", "cardan_fig3"), "quickstart_atlas")
 
 
 @dataclass(frozen=True)
 class Item:
-    """One figure: its scenes (methods of one analysis share a title), and the fixed parameters if it shows an atlas."""
+    """One figure: its scenes (methods of one analysis with one title, or a chart and its atlas), and the fixed parameters if
+    it shows an atlas."""
 
     title: str
     system: str
@@ -72,6 +75,7 @@ def items(folder: Path) -> list[Item]:
     for (system, _, title), paths in sorted(shared.items(), key=lambda pair: order[pair[0][0]]):
         parts = PARTS.get(paths[0].stem, {title: {}})
         several = len(parts) > 1
+        paths += [folder / f"{TRACED[path.stem]}.toml" for path in paths if path.stem in TRACED]
         found += [
             Item(name, system, tuple(paths), part, number if several else 0)
             for number, (name, part) in enumerate(parts.items(), 1)

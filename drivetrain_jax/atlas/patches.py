@@ -96,10 +96,12 @@ class Patches:
 
     def locate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Number of the patch of each point and the position in it, ``(N, d) -> (N,), (N, d)``; the nearest if outside."""
-        point = x[:, None]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            outside = np.maximum(self.lower - point, point - self.upper) / (self.upper - self.lower)
-        number = np.argmin(np.nan_to_num(np.maximum(outside, 0.0).max(axis=2), nan=np.inf), axis=1)
+        outside = np.zeros((len(x), len(self)))
+        # Axis by axis: NumPy reduces a last axis of length two slowly.
+        for point, lower, upper in zip(x.T[..., None], self.lower.T, self.upper.T, strict=True):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                np.maximum(outside, np.maximum(lower - point, point - upper) / (upper - lower), out=outside)
+        number = np.argmin(np.nan_to_num(outside, nan=np.inf, copy=False), axis=1)
         lower, upper = self.lower[number], self.upper[number]
         return number, ((x - lower) - (upper - x)) / (upper - lower)
 

@@ -177,7 +177,11 @@ def _add_export(subparsers: Any) -> None:
 def _add_plot(subparsers: Any) -> None:
     command = _command(subparsers, "plot", commands.plot, "draw the figure of a result")
     command.add_argument(
-        "files", metavar="FILE.nc", type=_path, nargs="+", help="results; several methods of one analysis are overlaid"
+        "files",
+        metavar="FILE.nc",
+        type=_path,
+        nargs="+",
+        help="results; overlaid: methods of one analysis, or a chart and its atlas",
     )
     command.add_argument(
         "--out",

@@ -13,7 +13,6 @@ from typing import Any
 
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._wording import counted
 from drivetrain_jax.cli.replies import INCOMPLETE, INTERRUPTED, OK, one_line, say
 from drivetrain_jax.cli.signals import stop_on_signals
 from drivetrain_jax.cli.values import assignments, ranges
@@ -97,15 +96,16 @@ def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[An
             )
         except Incomplete as error:
             return error.progress, INCOMPLETE, str(error)
-    return progress, OK, "" if options.quiet else _remarks(progress)
+    return progress, OK, "" if options.quiet else _remarks(progress, options.out)
 
 
-def _remarks(progress: Any) -> str:
-    """The note of a finished run, and its number of inaccurate points."""
+def _remarks(progress: Any, out: Path) -> str:
+    """The note of a finished run, and its values that miss the tolerance."""
     remarks = [progress.note] if progress.note else []
     if progress.inaccurate:
-        values = counted(progress.inaccurate, "value has", "values have")
-        remarks.append(f"{values} an error above the target (outcome tolerance_not_met)")
+        from drivetrain_jax.runs.misses import missed
+
+        remarks.append(missed(out, progress.inaccurate, progress.total))
     return "; ".join(remarks)
 
 

@@ -38,7 +38,8 @@ def plot(
 
     Args:
         result: a dataset, the path of a result file, or a list of them; an atlas is drawn with its boundaries and tips.
-        others: results of the same analysis by other methods, drawn into the same axes (``frequency_response``).
+        others: results of the same analysis by other methods, drawn into the same axes (``frequency_response``); or the
+            atlas of a chart (``floquet``), whose boundaries and tips are drawn over the cells.
         part: the part of an atlas to show: a number or ``(low, high)`` by the name of a parameter.
         cells: the number of cells of an atlas along each axis (default 800).
         units: units of the axes, ``"rpm,deg"`` or a list (default: those in which the scene gives its axes).
@@ -58,13 +59,18 @@ def plot(
         raise InputError("result = []: allowed is a result, or a list of one or more")
     asked = [] if units is None else listed(units)
     datasets = [_dataset(source) for source in sources]
-    if any(dataset.attrs.get("analysis") == "atlas" for dataset in datasets):
-        if len(datasets) > 1:
-            raise InputError("results: an atlas among several; allowed is an atlas alone")
+    kinds = [dataset.attrs.get("analysis") for dataset in datasets]
+    if kinds == ["atlas"]:
         return _drawn([_chart(sources[0], datasets[0], part, cells)], asked)
     if part is not None or cells is not None:
         field = f"part = {shown(part)}" if part is not None else f"cells = {cells}"
         raise InputError(f"{field}: a result on a grid is drawn whole; allowed for an atlas")
+    if kinds == ["floquet", "atlas"]:
+        from drivetrain_jax.runs.atlas_chart import with_boundaries
+
+        return _drawn([with_boundaries(_loaded(datasets[0]), _place(sources[1], datasets[1]))], asked)
+    if "atlas" in kinds:
+        raise InputError("results: an atlas among several; allowed is an atlas alone, or a chart and its atlas")
     try:
         return _drawn([_loaded(dataset) for dataset in datasets], asked)
     except (KeyError, IndexError) as error:
@@ -142,9 +148,12 @@ def _chart(
         if isinstance(value, (list, tuple)) and len(value) != 2:
             raise InputError(f"part.{name} = {shown(value)}: allowed is a number or (low, high)")
     shown_part = {name: tuple(value) if isinstance(value, list) else value for name, value in (part or {}).items()}
-    # An atlas is checked for damage if it is opened from its file.
-    place = Path(source) if isinstance(source, (str, Path)) else dataset
-    return chart(place, shown_part, CELLS if cells is None else cells)
+    return chart(_place(source, dataset), shown_part, CELLS if cells is None else cells)
+
+
+def _place(source: Result, dataset: xr.Dataset) -> Path | xr.Dataset:
+    """The file of an atlas, which is checked for damage as it is opened; its dataset if it has no file."""
+    return Path(source) if isinstance(source, (str, Path)) else dataset
 
 
 def _with_resonances(dataset: xr.Dataset) -> xr.Dataset:

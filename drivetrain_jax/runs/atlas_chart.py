@@ -25,7 +25,7 @@ from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.tips import Tips, find_tips
 from drivetrain_jax.atlas.windows import narrow
 from drivetrain_jax.runs.atlas_file import StoredAtlas, open_atlas
-from drivetrain_jax.runs.atlas_values import as_given
+from drivetrain_jax.runs.atlas_values import as_given, check_same
 from drivetrain_jax.runs.axes import in_unit
 from drivetrain_jax.runs.identity import program_identity
 from drivetrain_jax.runs.physical import in_parameters
@@ -71,6 +71,44 @@ def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, flo
     return dataset
 
 
+def with_boundaries(dataset: xr.Dataset, source: Path | xr.Dataset) -> xr.Dataset:
+    """``dataset``, a chart over two parameters, with the boundaries and tips of the atlas in ``source``.
+
+    Raises :class:`InputError` for an atlas of another system or of other fixed values, or of less than the chart's range.
+    """
+    atlas = open_atlas(source)
+    system = atlas.scene.system
+    if (name := dataset.attrs.get("system")) != system.name:
+        raise InputError(f"system = {name!r}: the atlas is one of {system.name}; allowed is a chart of {system.name}")
+    entries = json.loads(dataset.attrs.get("fixed_parameters", "{}"))
+    known = {name: np.asarray(entry["value"]) for name, entry in entries.items()}
+    swept = {str(axis.attrs.get("parameter", name)): axis for name, axis in dataset.coords.items()}
+    known |= {name: axis.values for name, axis in swept.items()}
+    for name in atlas.fixed.keys() & known.keys():
+        check_same(name, known[name].tolist(), atlas.fixed[name])
+    plane, fixed = {}, {}
+    for name in _shown(system, list(atlas.parameters)):
+        if name not in known:
+            raise InputError(f"{name}: missing in the chart; allowed is {atlas.allowed(name)}")
+        atlas.check_within(name, np.ravel(known[name]))
+        low, high = float(known[name].min()), float(known[name].max())
+        plane |= {name: (low, high)} if low < high else {}
+        fixed |= {} if low < high else {name: low}
+    if len(plane) != 2 or dataset["outcome"].squeeze().ndim != 2:
+        raise InputError(
+            f"axes: the chart varies {', '.join(plane)}; allowed beside an atlas are two of its parameters"
+        )
+    dataset = dataset.assign_coords(_stored_curves(atlas, fixed, plane, {}))
+    for name in plane:
+        axis = dataset[swept[name].dims[0]]
+        if axis.name != name:
+            size = axis.values[-1] / known[name][-1]
+            dataset = _curves_in_physical_units(
+                dataset, name, axis.name, axis.attrs["units"], partial(np.multiply, size)
+            )
+    return dataset
+
+
 def _physical_views(atlas: StoredAtlas, part: Mapping[str, Any]) -> dict[str, tuple[Parameter, Convert]]:
     """For each parameter that the scene or ``part`` gives in physical data: the quantity, and the way to its values."""
     given, _ = in_parameters(atlas.scene.system, part, atlas.scene.data)
@@ -93,20 +131,24 @@ def _back(back: Convert, size: float, values: Any) -> Any:
 
 def in_physical_units(dataset: xr.Dataset, name: str, quantity: Parameter, convert: Convert) -> xr.Dataset:
     """``dataset`` with the parameter ``name``, its boundaries and its tips also, or instead, as physical data."""
-    other, about = quantity.name, {"units": quantity.units}
-    coords = {}
+    other, own = quantity.name, dataset[name]
+    dataset = _curves_in_physical_units(dataset, name, other, quantity.units, convert)
+    about = {"units": quantity.units, "long_name": quantity.long_name}
+    dataset = dataset.assign_coords({other: (own.dims, convert(own.values), about)})
+    roles = {role: other if p == name else p for role, p in json.loads(dataset.attrs["roles"]).items()}
+    dataset = dataset.assign_attrs(roles=json.dumps(roles))
+    return dataset.swap_dims({name: other}) if own.ndim else dataset
+
+
+def _curves_in_physical_units(dataset: xr.Dataset, name: str, other: str, units: str, convert: Convert) -> xr.Dataset:
+    """``dataset`` with the boundaries and tips along ``name`` as values of the physical datum ``other``."""
     for prefix, suffix in (("boundary_", ""), ("tip_", ""), ("tip_", "_error"), ("undecided_", "")):
         if (old := f"{prefix}{name}{suffix}") in dataset.coords:
             values, label = dataset[old], dataset[old].attrs["long_name"].replace(name, other)
             # The conversions are linear.
-            coords[f"{prefix}{other}{suffix}"] = (values.dims, convert(values.values), {**about, "long_name": label})
-            dataset = dataset.drop_vars(old)
-    own = dataset[name]
-    coords[other] = (own.dims, convert(own.values), {**about, "long_name": quantity.long_name})
-    dataset = dataset.assign_coords(coords)
-    roles = {role: other if p == name else p for role, p in json.loads(dataset.attrs["roles"]).items()}
-    dataset = dataset.assign_attrs(roles=json.dumps(roles))
-    return dataset.swap_dims({name: other}) if own.ndim else dataset
+            new = (values.dims, convert(values.values), {"units": units, "long_name": label})
+            dataset = dataset.drop_vars(old).assign_coords({f"{prefix}{other}{suffix}": new})
+    return dataset
 
 
 def _ranges(atlas: StoredAtlas, part: Mapping[str, Any]) -> dict[str, Any]:

@@ -140,10 +140,32 @@ def test_what_plot_takes(folder, chart):
     assert zoom.axes[0].get_xlim() == same.axes[0].get_xlim() and 1.29 < zoom.axes[0].get_xlim()[0] < 1.31
 
 
+def test_a_chart_shows_the_tongues_of_its_atlas(folder, chart):
+    """The cells of this chart step over the tip of S21."""
+    lines = {line.get_label(): line for line in dt.plot(chart, folder / "atlas.nc").axes[0].get_lines()}
+    tip = lines["tip"].get_xydata()
+    assert np.allclose(tip, [[1.41599, 0.10633]], atol=1e-5)
+    boundary = lines["boundary"].get_xydata()
+    assert np.nanmin(boundary[:, 1]) < 0.107 and np.nanmax(boundary[:, 0]) <= 1.6
+    speeds = {"J1": 2.0, "k1": 8.0, "k2": 8.0, "J2": 200.0, "c1": 0.008, "c2": 0.008}
+    axes = {"angle": {"start": "0 deg", "stop": "30 deg", "num": 4}, "speed": {"start": 24.0, "stop": 30.0, "num": 3}}
+    physical = dt.run(CHART | {"axes": axes, "fixed": speeds})
+    (mark,) = (x for x in dt.plot(physical, folder / "atlas.nc").axes[0].get_lines() if x.get_label() == "tip")
+    assert np.allclose(mark.get_xydata(), [[1.41599 * 2 * 30 / np.pi, np.degrees(0.10633)]], rtol=1e-4)
+    with pytest.raises(dt.InputError, match=r"zeta = 0.01: the atlas is made for zeta = 0.001; allowed is that value"):
+        dt.plot(dt.run(CHART, overrides={"fixed.zeta": 0.01}), folder / "atlas.nc")
+    with pytest.raises(dt.InputError, match=r"Omega = 0.5: allowed is 1 <= Omega <= 2"):
+        dt.plot(dt.run(CHART, overrides={"axes.Omega.start": 0.5}), folder / "atlas.nc")
+
+
 @pytest.mark.parametrize(
     ("results", "options", "message"),
     [
-        (["atlas.nc", "chart.nc"], {}, "results: an atlas among several; allowed is an atlas alone"),
+        (
+            ["atlas.nc", "chart.nc"],
+            {},
+            "results: an atlas among several; allowed is an atlas alone, or a chart and its atlas",
+        ),
         (["chart.nc"], {"cells": 5}, "cells = 5: a result on a grid is drawn whole; allowed for an atlas"),
         ([], {}, "result = []: allowed is a result, or a list of one or more"),
         (["chart.nc"], {"units": 5}, 'units = 5: allowed are units such as "rpm,deg", or a list of them'),
