@@ -55,8 +55,8 @@ def _chart(file: ResultFile | None) -> list[str]:
     ]
     head = (
         f"Spectral radius, {file.notes[0]}, without compilation. Each method is shown at its fastest setting with an error "
-        f"of at most {GOAL:g}, or at its most accurate setting if it never gets there. Only `direct` gives an error bound "
-        "for every cell. " + page_text.machine({"throughput": file})
+        f"of at most {GOAL:g}, or at its most accurate setting if it never gets there. `direct` and `diffrax` give an error "
+        "bound for every cell. " + page_text.machine({"throughput": file})
     )
     return [head, markdown(["method", "cells/s", "largest error"], rows)]
 

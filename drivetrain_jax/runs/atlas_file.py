@@ -14,12 +14,12 @@ import numpy as np
 from drivetrain_jax import _compile_cache
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import counted, did_you_mean, shown
-from drivetrain_jax.analysis import Request, get_analysis
+from drivetrain_jax.analysis import OUTCOME, Request, get_analysis
 from drivetrain_jax.analysis.atlas.analysis import ANALYSIS
 from drivetrain_jax.analysis.request import make_request
-from drivetrain_jax.atlas import Atlas, StabilityAtlas, from_arrays, stability_atlas, to_arrays
+from drivetrain_jax.atlas import StabilityAtlas, from_arrays, stability_atlas, to_arrays
 from drivetrain_jax.atlas.floquet import floquet_domain
-from drivetrain_jax.runs.assemble import ResultBuffer, result_attrs, to_dataset
+from drivetrain_jax.runs.assemble import ResultBuffer, labelled, result_attrs, to_dataset
 from drivetrain_jax.runs.atlas_values import as_given, broadcast, check_same
 from drivetrain_jax.runs.axes import Axis
 from drivetrain_jax.runs.executor import Threads
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
     from drivetrain_jax.explore import Page
 
+# Values along each axis of the stored chart.
+_CELLS = 256
 # Relative error of forced amplitudes, which are compared with a limit.
 _AMPLITUDE = 1e-6
 # Variables of the file: name, dimensions, meaning. Boxes are in the coordinates named by the attribute.
@@ -61,8 +63,10 @@ _PANELS = tuple(name for name in _VARIABLES if name not in (*_DOMAIN, *_GAPS))
 _ATTRIBUTES = ("scene", "coordinates_of_panels", "tolerance", "solves")
 
 
-def to_labelled(atlas: Atlas, scene: Scene) -> Labelled:
-    """The result of a scene of an atlas."""
+def to_labelled(stability: StabilityAtlas, scene: Scene) -> Labelled:
+    """The result of a scene of an atlas: its panels, and a chart that readers without this package show."""
+    stored = StoredAtlas(scene, replace(stability, keep=partial(kept, scene.system)))
+    atlas, chart = stability.atlas, _chart(stored)
     arrays = to_arrays(atlas)
     data = {
         name: Entry(dims, arrays[name], {"units": "1", "long_name": meaning})
@@ -79,7 +83,22 @@ def to_labelled(atlas: Atlas, scene: Scene) -> Labelled:
         "tolerance": atlas.tolerance,
         "solves": atlas.solves,
     }
-    return Labelled(coords, data, attrs)
+    return Labelled(coords | chart.coords, data | chart.data, attrs)
+
+
+def _chart(atlas: StoredAtlas) -> Labelled:
+    """The results on ``_CELLS`` values of each of the first two parameters, with the others in the middle of their ranges.
+
+    Cells in gaps have no value.
+    """
+    shown = atlas.parameters[:2]
+    middle = {name: sum(ends) / 2 for name, ends in atlas.ranges.items() if name not in shown}
+    axes = {name: np.linspace(*atlas.ranges[name], _CELLS) for name in shown}
+    part = atlas.slice(middle)
+    whole = labelled(part.scene_on(axes), part.arrays(axes, solve=False), {})
+    fixed = {name: Entry((), np.array(value), atlas.labels(name)) for name, value in middle.items()}
+    # An outcome counts points of a run, and an atlas has none.
+    return Labelled(whole.coords | fixed, {n: e for n, e in whole.data.items() if n != OUTCOME.name}, {})
 
 
 def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:

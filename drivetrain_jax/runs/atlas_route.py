@@ -27,7 +27,7 @@ class AtlasRoute(Route):
     def in_memory(self, job: Job, work: Work, progress: Progress) -> Labelled:
         """The atlas; ``progress`` counts the solves."""
         stability, _ = build_atlas(job.scene, atlas_ranges(job.scene), work, progress)
-        return to_labelled(stability.atlas, job.scene).with_attrs(**job.attrs)
+        return to_labelled(stability, job.scene).with_attrs(**job.attrs)
 
     def into_file(
         self, job: Job, out: Path, temporary: Path, work: Work, progress: Progress, reused: ReusedPoints

@@ -95,6 +95,28 @@ def test_a_chart_through_an_atlas(direct):
     assert found.sizes["mu"] == 1 and (found["outcome"] <= Outcome.TOLERANCE_NOT_MET).all()
 
 
+def test_the_file_of_an_atlas_shows_a_chart_without_this_package(stored, atlas):
+    chart = stored[["spectral_radius", "verdict"]]
+    assert chart.verdict.dims == atlas.parameters and set(chart.sizes.values()) == {256}
+    expected = atlas.grid(**{name: chart[name].values for name in chart.dims})
+    np.testing.assert_array_equal(chart.verdict, expected.verdict)
+    bound = stored.spectral_radius_error + expected.spectral_radius_error
+    assert bool((abs(chart.spectral_radius - expected.spectral_radius) <= bound).all())
+
+
+def test_the_stored_chart_of_three_parameters_lies_in_the_middle_of_the_third():
+    axes = {
+        "Omega": {"start": 1.9, "stop": 2.0},
+        "beta": {"start": 0.0, "stop": 0.1},
+        "mu": {"start": 1.0, "stop": 1.1},
+    }
+    fixed = {name: value for name, value in BASE.items() if name != "mu"}
+    chart = dt.run({**ATLAS, "axes": axes, "fixed": fixed, "options": {"rtol": 1e-6}})
+    assert chart.verdict.dims == ("Omega", "beta") and chart.mu.item() == 1.05
+    point = dt.point("cardan", "floquet", beta=0.1, Omega=2.0, mu=1.05, **fixed)
+    assert abs(chart.spectral_radius[-1, -1] - point.spectral_radius) < 1e-6
+
+
 @pytest.mark.full
 def test_points_and_multipliers_through_an_atlas():
     random = np.random.default_rng(0)
