@@ -175,3 +175,17 @@ def test_the_determinant_dies_near_mode_12(swept):
     assert np.all(result.outcome == 1)
     certified = swept.angular_frequency.values[[0, 3], :5]
     np.testing.assert_allclose(result.angular_frequency.values[[0, 2], :5], certified, rtol=1e-11)
+
+
+def test_a_stiffer_support_lowers_the_amplitudes_at_the_characteristic_points():
+    """Conclusion 3 of the paper, f_A = 1 and k_D from 20e6 to 85e6; expected from transfer matrices in 40 digits."""
+    stations, points = 92, [7, 66, 91]
+    soft, stiff = (
+        dt.critical_speeds(
+            Bicardan(**PRESETS["paper_fitted"] | {"k_D": k}), outputs=["mode_shape"], modes=2, stations=stations
+        )
+        for k in (20e6, 85e6)
+    )
+    ratio = [s.mode_shape[:, points] / s.mode_shape[:, :1] for s in (soft, stiff)]
+    expected = [[1.01745, 1.03817, 4.3476], [1.04585, 1.00416, 4.58017]]
+    np.testing.assert_allclose(ratio[0] / ratio[1], expected, rtol=1e-5)
