@@ -10,6 +10,7 @@ import numpy as np
 
 import drivetrain_jax as dt
 from benchmarks.validation.document import markdown
+from drivetrain_jax.atlas.tips import find_tips
 from tests.oracles.cardan_paper import natural_frequencies, predicted_speeds, printed_matrices, unstable_fraction
 from tests.oracles.cardan_reference import BASE_CASE, spectral_radius, stacked_monodromy
 
@@ -31,6 +32,9 @@ def found() -> dict[str, str]:
         "frequencies": ", ".join(f"{x:.7f}" for x in natural_frequencies()),
         "fig3": f"{float(fig3.mean()):.4f}",
         "fig4": f"{float(fig4.mean()):.4f}",
+        "fig6": f"{float(fig6.mean()):.4f}",
+        "stiff": _list(_quarters(fig6, "Omega")),
+        "tips": _tips(),
         "upright": _list(_tongue("cardan_fig5", "alpha", (1.0, 10.0, 20.0))),
         "inclined": _list(_tongue("cardan_fig7", "mu", (0.5, 1.0, 2.0))),
         "peaks": ", ".join(f"{speeds[name]:.3f}" for name in ("S21", "C+1", "H21")),
@@ -74,6 +78,14 @@ def _unstable(scene: str) -> Any:
 def _quarters(unstable: Any, along: str) -> np.ndarray:
     other = next(name for name in unstable.dims if name != along)
     return np.array([part.mean() for part in np.array_split(unstable.transpose(along, other).values, 4)])
+
+
+def _tips() -> str:
+    """The tips of the tongues below beta = 0.6, by speed."""
+    axes = {"beta": {"start": 0.0, "stop": 0.6}, "Omega": {"start": 0.06, "stop": 2.0}}
+    atlas = dt.open_atlas(dt.run({"system": "cardan", "analysis": "atlas", "axes": axes, "fixed": BASE_CASE}))
+    tips = sorted(find_tips(atlas.stability.atlas, atlas.scene.system).tips, key=lambda tip: tip.point["Omega"])
+    return ", ".join(f"{tip.name} {tip.point['beta']:.4f} at {tip.point['Omega']:.4f}" for tip in tips)
 
 
 def _shares_by_stiffness() -> tuple[np.ndarray, list[float]]:

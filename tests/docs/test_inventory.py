@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 TITLE = "## Every equation, figure, table and conclusion"
 # Equations without those with a letter, figures, tables; conclusions and whatever else the paper states.
 PAPERS = {
-    "cardan": (26, 7, 2, ("Conclusion ", 6), ("Section 6", 1)),
+    "cardan": (26, 7, 2, ("Conclusion ", 7), ("Section 6", 2)),
     "tripod": (39, 30, 4, ("Conclusion ", 8), ("Appendix ", 2)),
     "bicardan": (31, 4, 0, ("Conclusion ", 5), ("Section 4", 3)),
     "planetary": (40, 12, 7, ("Conclusion: ", 7)),
