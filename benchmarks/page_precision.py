@@ -1,4 +1,4 @@
-"""The work-precision part of docs/benchmarks.md: the fastest method at an error of 1e-9, and failures at the extremes."""
+"""The regions of docs/benchmarks.md: the fastest methods at an error of 1e-9, and silent failures."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.precision import GOAL, Judgement, Rung, judge, read
-from benchmarks.results_files import LEVEL, is_level, markdown, not_measured, seconds, small, times
+from benchmarks.precision import GOAL, Rung, is_silent, read
+from benchmarks.results_files import LEVEL, markdown, not_measured, seconds, small, times
 
 # Methods that a user of the package can choose; all others are rivals.
 OWN = "package"
@@ -48,11 +48,6 @@ class Precision:
         good = [rung for rung in (self.reaching(region, name) for name in names) if rung]
         return min(good, key=lambda rung: rung.seconds_per_point, default=None)
 
-    def judgement(self, region: str, method: str) -> Judgement | None:
-        """The judgement of a method in a region; None if the method was not tried there."""
-        rungs = self.ladder(region, method)
-        return judge(rungs) if rungs else None
-
 
 def is_own(method: str) -> bool:
     """True if the method belongs to the package."""
@@ -63,11 +58,6 @@ def load_precision(folder: Path) -> dict[str, Precision]:
     """All systems that have been measured."""
     paths = {system: folder / f"precision_{system}.csv" for system in TITLES}
     return {system: Precision(system, read(path)) for system, path in paths.items() if path.is_file()}
-
-
-def conclusions(found: dict[str, Precision]) -> list[str]:
-    """Regions won and lost by each system, then silent failures."""
-    return [*(_winners(precision) for precision in found.values()), *(_silence(list(found.values())) if found else [])]
 
 
 def losses(found: dict[str, Precision]) -> str:
@@ -107,110 +97,45 @@ def compared(precision: Precision) -> list[Compared]:
     return found
 
 
-def _winners(precision: Precision) -> str:
-    regions = compared(precision)
-    won = [one for one in regions if one.ratio >= LEVEL]
-    finite = [one.ratio for one in won if math.isfinite(one.ratio)]
-    ends = list(dict.fromkeys(times(end(finite)) for end in (min, max))) if finite else []
-    span = f", {' to '.join(ends)} times the fastest rival" if ends else ""
-    alone = [one.region for one in won if math.isinf(one.ratio)]
-    parts = [f"faster in {len(won)} of {len(regions)} regions{span}"] if won else []
-    for words, names in (
-        ("alone in reaching the error in", alone),
-        ("level in", [f"{one.region} ({one.rival})" for one in regions if is_level(one.ratio)]),
-        ("**slower** in", [f"{one.region} ({times(1 / one.ratio)} times, {one.rival})"
-                           for one in regions if 0 < one.ratio <= 1 / LEVEL]),
-        ("behind, without reaching the error, in", [f"{one.region} ({one.rival})" for one in regions if one.ratio == 0]),
-        ("like all rivals above the error in", [one.region for one in regions if math.isnan(one.ratio)]),
-    ):  # fmt: skip
-        parts += [f"{words} {'; '.join(names)}"] if names else []
-    return f"`{precision.system}`: {', '.join(parts)}."
-
-
 def silent(systems: Iterable[Precision]) -> dict[str, list[str]]:
     """Systems and regions in which a method fails silently, by method."""
     found: dict[str, list[str]] = {}
     for precision in systems:
         for region in precision.regions:
             for method in precision.methods:
-                judged = precision.judgement(region, method)
-                if judged and judged.word == "SILENT":
+                if any(map(is_silent, precision.ladder(region, method))):
                     found.setdefault(method, []).append(f"{precision.system} {region}")
     return found
 
 
-def _silence(systems: Sequence[Precision]) -> list[str]:
-    own, rivals = [], []
-    for method, regions in silent(systems).items():
-        (own if is_own(method) else rivals).append(f"{method} ({', '.join(regions)})")
-    names = ", ".join(f"`{precision.system}`" for precision in systems)
-    first = (
-        f"**The package fails silently** in: {'; '.join(own)}."
-        if own
-        else f"No method of the package fails silently in any region measured ({names})."
-    )
-    return [first, f"Rivals that fail silently: {'; '.join(rivals)}."] if rivals else [first]
+def silence(found: dict[str, Precision]) -> str:
+    """The methods that fail silently, the package's first, with the number of their regions."""
+    if not found:
+        return not_measured("precision_cardan")
+    regions = {method: len(places) for method, places in silent(found.values()).items()}
+    own = {method: places for method, places in silent(found.values()).items() if is_own(method)}
+    told = [f"{method} ({', '.join(places)})" for method, places in own.items()]
+    head = f"**The package fails silently**: {'; '.join(told)}." if told else "No method of the package fails silently."
+    rivals = [f"{method} ({number})" for method, number in regions.items() if method not in own]
+    return f"{head} Rivals, with the number of their regions: {', '.join(rivals) or 'none'}."
 
 
-def section(folder: Path, images: str, system: str, found: dict[str, Precision]) -> str:
-    """Figure, table of times at 1e-9 and table of extremes of one system."""
-    name = f"precision_{system}"
-    title = f"### {TITLES[system]}"
-    if system not in found:
-        return f"{title}\n\n{not_measured(name)}"
-    precision = found[system]
-    return "\n\n".join(
-        [
-            title,
-            f"![Error against time per point, one panel for each region]({images}{name}.png)",
-            f"Time per point (error) at the fastest setting with an error of at most {GOAL:g} at every point. "
-            f"`only`: the smallest error, if no setting reaches {GOAL:g}. Bold: the fastest method of each region, and all "
-            f"methods within {LEVEL - 1:.0%} of it.",
-            _times_table(precision),
-            "At the extremes:",
-            _extremes_table(precision),
-        ]
-    )
-
-
-def _times_table(precision: Precision) -> str:
-    best = {}
-    for region in precision.regions:
-        both = [rung for rung in (precision.fastest(region, own) for own in (True, False)) if rung]
-        best[region] = min(both, key=lambda rung: rung.seconds_per_point, default=None)
+def regions(found: dict[str, Precision], images: str) -> str:
+    """The fastest setting of the package and of the rivals in every region, and a link to all settings."""
     rows = []
-    for method in precision.methods:
-        cells = [_time_cell(precision, region, method, best[region]) for region in precision.regions]
-        rows.append([method, *cells])
-    return markdown(["method", *precision.regions], rows)
+    for system, precision in found.items():
+        for one in compared(precision):
+            own, rival = (precision.fastest(one.region, mine) for mine in (True, False))
+            ratio = "" if own is None or rival is None else times(one.ratio)
+            rows.append([system, one.region, _told(own), _told(rival), ratio])
+    missing = [not_measured(f"precision_{system}") for system in TITLES if system not in found]
+    links = ", ".join(f"[{TITLES[system]}]({images}precision_{system}.png)" for system in found)
+    text = "Time per point of the fastest method, and its error. The error of every setting: "
+    table = [f"{text}{links}.", markdown(["system", "region", "package", "fastest rival", "ratio"], rows)]
+    return "\n\n".join([*(table if found else []), *missing])
 
 
-def _time_cell(precision: Precision, region: str, method: str, best: Rung | None) -> str:
-    rung = precision.reaching(region, method)
-    if rung is not None:
-        text = f"{seconds(rung.seconds_per_point)} ({small(rung.error)})"
-        return f"**{text}**" if best and is_level(rung.seconds_per_point / best.seconds_per_point) else text
-    errors = [rung.error for rung in precision.ladder(region, method) if not math.isnan(rung.error)]
-    return f"only {small(min(errors))}" if errors else "-"
-
-
-def _extremes_table(precision: Precision) -> str:
-    rows = []
-    for method in precision.methods:
-        judged = [precision.judgement(region, method) for region in precision.regions]
-        rows.append([method, *(_extreme_cell(one) for one in judged)])
-    return markdown(["method", *precision.regions], rows)
-
-
-def _extreme_cell(judged: Judgement | None) -> str:
-    if judged is None:
-        return "-"
-    if judged.word == "holds":
-        return f"holds{_notice(judged.how)}"
-    word = f"**{judged.word}**" if judged.word == "SILENT" else judged.word
-    return f"{word}: {judged.how}"
-
-
-def _notice(how: str) -> str:
-    _, _, notice = how.partition("; ")
-    return f" ({notice})" if notice else ""
+def _told(rung: Rung | None) -> str:
+    if rung is None:
+        return "does not reach the error"
+    return f"{rung.method.removeprefix(f'{OWN}, ')}: {seconds(rung.seconds_per_point)} ({small(rung.error)})"

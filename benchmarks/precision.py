@@ -9,8 +9,8 @@ that a slow contender runs only once. The column ``timed`` of the CSV is the num
 
 ``error`` is the largest relative error of the points with a result, NaN without any; ``failed`` counts points without a
 usable result; ``noticed`` is the way in which a user learns of the failure: the name of an outcome, a warning, an
-exception. ``judge`` classifies a method by its rungs in a region: it holds, degrades, fails, or is SILENT, which means
-wrong by more than ``PATIENCE`` times its tolerance without any notice.
+exception. A setting is silent if it is wrong without any notice by more than ``USELESS``, or by more than ``PATIENCE`` times
+its tolerance.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from benchmarks.timing import RESULTS, at_once, interleaved, median, write_csv
 REPEATS, SPENT = 9, 0.3
 # Largest error in tolerances that is no failure: the global error is commonly ten to some hundred tolerances of a step.
 PATIENCE = 1e3
-# Largest error of a method without a tolerance (with a number of steps) at its finest setting that needs no notice.
+# Largest error that needs no notice, whatever was asked for.
 USELESS = 0.1
 GOAL = 1e-9
 
@@ -155,46 +155,14 @@ def tolerance(setting: str) -> float | None:
     return float(found[1]) if found else None
 
 
-class Judgement(NamedTuple):
-    """``word`` is holds, degrades, fails or SILENT; ``how`` gives the errors and the notice."""
+def is_silent(rung: Rung) -> bool:
+    """True if ``rung`` lacks points or is wrong by more than it may be, and the user gets no notice.
 
-    word: str
-    how: str
-
-
-def judge(rungs: Sequence[Rung]) -> Judgement:
-    """The judgement of a method in a region, from all its rungs there."""
-    silent = [rung for rung in rungs if is_silent(rung, rungs)]
-    if silent:
-        worst = max(silent, key=lambda rung: math.inf if math.isnan(rung.error) else rung.error)
-        return Judgement("SILENT", f"{_percent(worst)} at {worst.setting}")
-    notices = ", ".join(dict.fromkeys(rung.noticed for rung in rungs if rung.noticed))
-    answered = [rung for rung in rungs if not math.isnan(rung.error) and rung.failed < rung.points]
-    if not answered:
-        return Judgement("fails", notices)
-    best = min(answered, key=lambda rung: (rung.failed > 0, rung.error))
-    told = f"; {notices}" if notices else ""
-    if best.error <= GOAL and not best.failed:
-        return Judgement("holds", f"{best.error:.0e} at {best.setting}{told}")
-    if best.error > USELESS:
-        return Judgement("fails", f"{best.error:.0e} at best{told}")
-    return Judgement("degrades", f"{_percent(best)} at best, {best.setting}{told}")
-
-
-def is_silent(rung: Rung, ladder: Sequence[Rung]) -> bool:
-    """True if ``rung`` is wrong by more than it may be, and the user gets no notice."""
-    if rung.noticed:
-        return False
-    promised = tolerance(rung.setting)
-    # Of a method without a tolerance only the finest setting must be right.
-    unpromised = USELESS if rung is ladder[-1] else math.inf
-    allowed = unpromised if promised is None else min(PATIENCE * promised, USELESS)
-    return rung.failed > 0 or not rung.error <= allowed
-
-
-def _percent(rung: Rung) -> str:
-    lost = f", {rung.failed} of {rung.points} points lost" if rung.failed else ""
-    return f"error {rung.error:.0e}{lost}"
+    One rule for all methods: the error may be ``USELESS``, and ``PATIENCE`` times the tolerance if one is asked for.
+    """
+    asked = tolerance(rung.setting)
+    allowed = USELESS if asked is None else min(PATIENCE * asked, USELESS)
+    return not rung.noticed and (rung.failed > 0 or not rung.error <= allowed)
 
 
 def write(name: str, rungs: Sequence[Rung], notes: Sequence[str] = (), folder: Path = RESULTS) -> None:
@@ -208,12 +176,3 @@ def read(path: Path) -> list[Rung]:
         rows = csv.DictReader(line for line in file if not line.startswith("#"))
         kinds = {field.name: {"float": float, "int": int}.get(str(field.type), str) for field in fields(Rung)}
         return [Rung(**{name: kinds[name](text) for name, text in row.items()}) for row in rows]
-
-
-def judgements(rungs: Sequence[Rung]) -> list[tuple[str, str, str, str]]:
-    """``(region, method, word, how)`` of every pair, in the order of the file."""
-    pairs = dict.fromkeys((rung.region, rung.method) for rung in rungs)
-    return [
-        (region, method, *judge([r for r in rungs if (r.region, r.method) == (region, method)]))
-        for region, method in pairs
-    ]

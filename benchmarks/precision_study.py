@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from benchmarks.precision import REPEATS, SPENT, Contender, judgements, measure, write
+from benchmarks.precision import REPEATS, SPENT, Contender, is_silent, measure, write
 from benchmarks.precision_figure import draw
 from benchmarks.timing import parser, results_folder
 
@@ -21,5 +21,6 @@ def study(name: str, doc: str, contenders: Contenders, argv: Sequence[str] | Non
     about = f"medians of up to {repeats} runs in turns, as many as {spent:g} s allow ('timed'), without compilation"
     write(name, rungs, [about, *notes], folder)
     draw(name, rungs, folder)
-    for region, method, word, how in judgements(rungs):
-        print(f"{region:18} {method:32} {word:9} {how}")
+    for rung in rungs:
+        silent = "SILENT" if is_silent(rung) else ""
+        print(f"{rung.region:18} {rung.method:32} {rung.setting:16} {rung.error:.0e} {rung.noticed or silent}")

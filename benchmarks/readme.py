@@ -19,7 +19,7 @@ from benchmarks.results_files import (
     seconds,
     small,
 )
-from benchmarks.timing import RESULTS
+from benchmarks.timing import CHART_RANGE, RESULTS
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 NAMES = ("throughput", "critical_speeds", "atlas")
@@ -50,15 +50,15 @@ def _chart(file: ResultFile | None) -> list[str]:
     exact = [_most_exact(file, name) for name in LABELS if name not in good]
     shown = [*(row for name, row in good.items() if name in LABELS), *filter(None, exact)]
     rows = [
-        [_label(row), count(row["cells_per_s"]), small(row["max_error"])]
+        [_label(row), f"{int(row['cells']):,}", count(row["cells_per_s"]), small(row["max_error"])]
         for row in sorted(shown, key=lambda row: -float(row["cells_per_s"]))
     ]
     head = (
-        f"Spectral radius, {file.notes[0]}, without compilation. Each method is shown at its fastest setting with an error "
-        f"of at most {GOAL:g}, or at its most accurate setting if it never gets there. `direct` and `diffrax` give an error "
-        "bound for every cell. " + page_text.machine({"throughput": file})
+        f"Spectral radius, Omega from {CHART_RANGE['Omega'][0]:g} on, {file.notes[0]}, without compilation. Each method is "
+        f"shown at its fastest setting with an error of at most {GOAL:g}, or at its most accurate setting if it never gets "
+        f"there. `direct` and `diffrax` give an error bound for every cell. {page_text.machine({'throughput': file})}"
     )
-    return [head, markdown(["method", "cells/s", "largest error"], rows)]
+    return [head, markdown(["method", "cells that it computed", "cells/s", "largest error"], rows)]
 
 
 def _label(row: Row) -> str:

@@ -12,6 +12,7 @@ with SciPy and with ``direct``.
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -171,9 +172,10 @@ def shared_out(
 
 
 def fresh_process(columns: Columns) -> dict[str, float]:
-    """Seconds from the first import to the result, and peak memory, of the chart in a fresh process."""
+    """Seconds from the first import to the result, compilation included, and peak memory of the chart in a fresh process."""
     given = json.dumps(scene(columns, "direct", {"rtol": 1e-10}))
-    done = subprocess.run([sys.executable, "-c", _FRESH, given], check=True, capture_output=True, text=True)
+    alone = os.environ | {"DRIVETRAIN_JAX_CACHE": "0"}
+    done = subprocess.run([sys.executable, "-c", _FRESH, given], check=True, capture_output=True, text=True, env=alone)
     return json.loads(done.stdout.splitlines()[-1])
 
 
@@ -248,7 +250,7 @@ def notes(columns: Columns, repeats: int, sample: int, rtol: float | None) -> li
     return [
         f"chart of {columns['beta'].size:,} cells, medians of {repeats} interleaved repeats, {PROCESSES} cores",
         f"reference heyoka 1e-15: differs from {trusted}",
-        f"fresh process, direct rtol 1e-10: import to result {fresh['seconds']:.1f} s, "
+        f"fresh process, no compiled code, direct rtol 1e-10: import to result {fresh['seconds']:.1f} s, "
         f"peak memory {fresh['megabytes']:.0f} MB",
     ]
 

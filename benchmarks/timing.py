@@ -54,10 +54,15 @@ def results_folder(options: argparse.Namespace) -> Path:
     return folder
 
 
+# Range of the chart that all methods compute.
+CHART_RANGE = {"beta": (0.0, 1.5), "Omega": (0.1, 2.0)}
+
+
 def chart(cells: int) -> dict[str, np.ndarray]:
-    """Columns of about ``cells`` cells of the chart beta in [0, 1.5] x Omega in [0.1, 2], base case, of shape 3:4."""
+    """Columns of about ``cells`` cells of the chart over ``CHART_RANGE``, base case, of shape 3:4."""
     rows = max(2, round((cells * 3 / 4) ** 0.5))
-    beta, omega = np.linspace(0.0, 1.5, rows), np.linspace(0.1, 2.0, max(2, round(cells / rows)))
+    sizes = (rows, max(2, round(cells / rows)))
+    beta, omega = (np.linspace(*ends, size) for ends, size in zip(CHART_RANGE.values(), sizes, strict=True))
     grid = np.meshgrid(beta, omega, indexing="ij")
     fixed = {name: np.full(grid[0].size, value) for name, value in BASE_CASE.items()}
     return {"beta": grid[0].ravel(), "Omega": grid[1].ravel(), **fixed}
