@@ -83,7 +83,7 @@ def to_labelled(stability: StabilityAtlas, scene: Scene) -> Labelled:
         "tolerance": atlas.tolerance,
         "solves": atlas.solves,
     }
-    return Labelled(coords | chart.coords, data | chart.data, attrs)
+    return Labelled({**coords, **chart.coords}, {**data, **chart.data}, attrs)
 
 
 def _chart(atlas: StoredAtlas) -> Labelled:
@@ -98,7 +98,7 @@ def _chart(atlas: StoredAtlas) -> Labelled:
     whole = labelled(part.scene_on(axes), part.arrays(axes, solve=False), {})
     fixed = {name: Entry((), np.array(value), atlas.labels(name)) for name, value in middle.items()}
     # An outcome counts points of a run, and an atlas has none.
-    return Labelled(whole.coords | fixed, {n: e for n, e in whole.data.items() if n != OUTCOME.name}, {})
+    return Labelled({**whole.coords, **fixed}, {n: e for n, e in whole.data.items() if n != OUTCOME.name}, {})
 
 
 def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
