@@ -8,8 +8,9 @@ from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis._base import Request
 from drivetrain_jax.analysis.frequency_response import analysis as frequency_response
 from drivetrain_jax.analysis.frequency_response import harmonic_branch, harmonic_response
-from drivetrain_jax.analysis.impacts import exact_branch, orbit_branch
-from drivetrain_jax.analysis.impacts.branch_sections import distinct
+from drivetrain_jax.analysis.impacts import exact_branch
+from drivetrain_jax.analysis.numerics import continuation
+from drivetrain_jax.analysis.numerics.branch_sections import distinct
 from drivetrain_jax.systems import rattle
 from tests.quick_jit import quick_jit
 
@@ -58,7 +59,7 @@ def test_a_motion_that_cannot_be_corrected(method, module, name, monkeypatch):
 
 @pytest.mark.full
 def test_a_branch_of_too_many_steps_is_not_complete(monkeypatch):
-    monkeypatch.setattr(orbit_branch, "_BUDGET", 500.0)
+    monkeypatch.setattr(continuation, "_BUDGET", 500.0)
     np.testing.assert_array_equal(branch("exact")[1], Outcome.TOLERANCE_NOT_MET)
 
 

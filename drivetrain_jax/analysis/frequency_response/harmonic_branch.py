@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from drivetrain_jax.analysis.frequency_response.harmonic_balance import Basis, balance, contact, jacobian, residual
-from drivetrain_jax.analysis.impacts.branch_sections import Course, sections
+from drivetrain_jax.analysis.numerics.branch_sections import Course, sections
 from drivetrain_jax.analysis.numerics.linear_algebra import solve
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 

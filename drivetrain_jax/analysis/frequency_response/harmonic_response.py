@@ -17,9 +17,9 @@ from drivetrain_jax.analysis.frequency_response.harmonic_balance import Basis, b
 from drivetrain_jax.analysis.frequency_response.harmonic_branch import Branch, at_frequency, trace
 from drivetrain_jax.analysis.frequency_response.harmonic_stability import half_trace, spectral_radius
 from drivetrain_jax.analysis.frequency_response.harmonic_sweep import sweep
-from drivetrain_jax.analysis.impacts.branch_sections import course, distinct
 from drivetrain_jax.analysis.impacts.motion import ABSENT, STABLE, UNSTABLE, imbalance, phase_lag, regime
 from drivetrain_jax.analysis.numerics.amplitude_roots import refined
+from drivetrain_jax.analysis.numerics.branch_sections import course, distinct
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 BRANCHES = 7

@@ -1,7 +1,7 @@
 """All orbits of the drive's period on the branch of a sweep, stable or not, with the folds and period doublings.
 
 The branch runs through the first motion of period one of the sweep up. Continuation by arc length goes both ways to the
-ends of the line (:mod:`~drivetrain_jax.analysis.impacts.orbit_branch`). Newton's method corrects the orbits at the
+ends of the line (:mod:`~drivetrain_jax.analysis.numerics.continuation`). Newton's method corrects the orbits at the
 frequencies of the line. Orbits of longer periods and closed branches are not included.
 """
 
@@ -15,17 +15,48 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis.impacts.attractor import take
-from drivetrain_jax.analysis.impacts.branch_sections import course, distinct, sections
 from drivetrain_jax.analysis.impacts.motion import ABSENT, STABLE, UNSTABLE
-from drivetrain_jax.analysis.impacts.orbit_branch import Branch, doubling_test, fold_test, follow, locate, scale_of
 from drivetrain_jax.analysis.impacts.orbit_measures import measure
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
 from drivetrain_jax.analysis.impacts.plane_map import newton_correction, spectral_radius
+from drivetrain_jax.analysis.numerics.branch_sections import course, distinct, sections
+from drivetrain_jax.analysis.numerics.continuation import Mapped, PeriodMap, folds_and_doublings, follow
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 BRANCHES, SPECIAL = 7, 16
 _ATTEMPTS, _LONGEST = 3000, 0.04
+# Relative difference for the derivative by omega.
+_DIFFERENCE = 1e-6
 _BLOCK, _CORRECTIONS, _MOST_STEPS, _MARGIN = 64, 6, 100_000, 1e-9
+
+
+def _scale(model: PiecewiseLinearOscillator, x: Array, highest: float) -> Array:
+    """Units for ``(u, v, omega)`` on the branch through ``x``, ``(3, N)``, up to the frequency ``highest``.
+
+    Size of its state, size times omega, and omega; the geometric mean of both frequencies replaces omega, otherwise there
+    would be too many steps.
+    """
+    usual = jnp.sqrt(x[2] * highest)
+    size = jnp.abs(x[0]) + jnp.abs(x[1]) / x[2] + model.b
+    return jnp.stack([size, size * usual, usual])
+
+
+def _period_map(model: PiecewiseLinearOscillator) -> PeriodMap:
+    """The map of ``(u, v, omega)`` over a drive period; the derivative by omega is a forward difference."""
+
+    def mapped(x: Array) -> Mapped:
+        omega = jnp.concatenate([x[2], x[2] * (1 + _DIFFERENCE)])
+        twice = {name: jnp.tile(value, 2) for name, value in vars(model).items() if name != "omega" and jnp.ndim(value)}
+        lanes = prepare(replace(model, **twice).at(omega))
+        end = march(lanes, start(lanes, jnp.tile(x[0], 2), jnp.tile(x[1], 2), jnp.asarray(1, jnp.int32)), _MOST_STEPS)
+        half = x.shape[1]
+        state = jnp.stack([end.u, end.v])
+        slope = (state[:, half:] - state[:, :half]) / (omega[half:] - omega[:half])
+        missing = jnp.where(end.left[:half] > 0, jnp.nan, 0.0)
+        matrix = jnp.stack(end.matrix)[:, :half].reshape(2, 2, half)
+        return Mapped(state[:, :half] + missing, matrix, slope, end.steps[:half])
+
+    return mapped
 
 
 def branch(
@@ -46,8 +77,10 @@ def branch(
     twice = jnp.tile(first, (1, 2))
     way = jnp.repeat(jnp.array([1.0, -1.0]), first.shape[1])
     limits = (low * (1 - 1e-9), high * (1 + 1e-9))
-    found = follow(both, 1, twice, direction=way, attempts=_ATTEMPTS, longest=_LONGEST, limits=limits)
-    along = course(found.x, scale_of(both, twice, limits[1]))
+    scale = _scale(both, twice, limits[1])
+    mapped = _period_map(both)
+    found = follow(mapped, twice, scale, direction=way, attempts=_ATTEMPTS, longest=_LONGEST, limits=limits)
+    along = course(found.x, scale)
     guess, exists, every = jax.lax.map(lambda w: sections(along, w, BRANCHES), jnp.asarray(omega))
     lanes = first.shape[1]
     number = np.broadcast_to(np.arange(omega.size)[:, None, None] * lanes, exists.shape)
@@ -61,8 +94,10 @@ def branch(
     complete &= _ended(found.x[:, 2], limits).reshape(2, lanes).all(axis=0)
     complete &= (found.x[:, 2] >= high).any(axis=0).reshape(2, lanes).any(axis=0)
     if special:
-        frequencies, all_found = _special(both, found, (low, high))
-        results |= {name: _along(x, omega) for name, x in frequencies.items()}
+        every_map = lambda index: _period_map(take(both, index))  # noqa: E731
+        frequencies, all_found = folds_and_doublings(every_map, found, (low, high), SPECIAL, SPECIAL, 2)
+        for name, x in zip(("fold_frequency", "doubling_frequency"), frequencies, strict=True):
+            results[name] = jnp.broadcast_to(x, (omega.size, *x.shape))
         complete &= all_found
     return results, complete
 
@@ -76,10 +111,6 @@ def _points(model: PiecewiseLinearOscillator, omega: np.ndarray, lanes: int) -> 
     """The oscillators of all points, frequencies first."""
     own = {k: jnp.tile(v, omega.size) for k, v in vars(model).items() if k != "omega" and jnp.ndim(v)}
     return replace(model, **own).at(jnp.asarray(np.repeat(omega, lanes)))
-
-
-def _along(values: Array, omega: np.ndarray) -> Array:
-    return jnp.broadcast_to(values, (omega.size, *values.shape))
 
 
 def _ordered(results: dict[str, Array], exists: Array) -> tuple[dict[str, Array], Array]:
@@ -143,41 +174,3 @@ def _described(model: PiecewiseLinearOscillator, states: Array, exists: Array, w
         "branch_u_min": jnp.where(there, seen.low, jnp.nan),
         "branch_stability": jnp.where(there, stability, ABSENT).astype(jnp.int8),
     }
-
-
-def _special(
-    model: PiecewiseLinearOscillator, found: Branch, limits: tuple[float, float]
-) -> tuple[dict[str, Array], Array]:
-    """Frequencies of folds and period doublings within the limits, ``(16, N)``, rising, NaN after the last one.
-
-    The second result is true if the branches have no others.
-    """
-    tests = jnp.stack([fold_test(found.matrix), doubling_test(found.matrix)])
-    changes = (tests[:, 1:] * tests[:, :-1] < 0).transpose(1, 0, 2)
-    lanes = changes.shape[2]
-
-    # One more than the results hold, to detect further ones.
-    above = jnp.maximum(found.x[1:, 2], found.x[:-1, 2])[:, None]
-    above = jnp.where(changes, above, -jnp.inf)
-    place = jnp.argsort(-above, axis=0)[: SPECIAL + 1]
-    exists = jnp.take_along_axis(changes, place, axis=0)
-    column = jnp.broadcast_to(jnp.arange(lanes), place.shape)
-    kind = jnp.broadcast_to(jnp.arange(2)[:, None], place.shape)
-
-    def at(shift: int) -> tuple[Array, Array]:
-        x = jnp.where(exists[:, :, None], jnp.moveaxis(found.x[place + shift, :, column], -1, 2), jnp.nan)
-        value = jnp.where(exists, tests[kind, place + shift, column], jnp.nan)
-        return jnp.moveaxis(x, 2, 0).reshape(3, -1), value.reshape(-1)
-
-    (before, first), (after, second) = at(0), at(1)
-    flat = column.reshape(-1)
-    x = locate(take(model, flat), 1, (before, after), (first, second), kind.reshape(-1) == 1)
-    omega = x[2].reshape(place.shape)
-    lost = jnp.any(exists & jnp.isnan(omega), axis=(0, 1)).reshape(2, -1).any(axis=0)
-    omega = jnp.where((omega >= limits[0]) & (omega <= limits[1]), omega, jnp.nan)
-    # Join both ways of the branch, select the highest frequencies, then sort them.
-    omega = jnp.moveaxis(omega.reshape(-1, 2, 2, lanes // 2), 2, 0).reshape(-1, 2, lanes // 2)
-    falling = -jnp.sort(-jnp.where(jnp.isnan(omega), -jnp.inf, omega), axis=0)
-    more = jnp.any(jnp.isfinite(falling[SPECIAL]), axis=0)
-    omega = jnp.sort(jnp.where(jnp.isinf(falling[:SPECIAL]), jnp.nan, falling[:SPECIAL]), axis=0)
-    return {"fold_frequency": omega[:, 0], "doubling_frequency": omega[:, 1]}, ~lost & ~more

@@ -48,26 +48,40 @@ def solve(a: Array, b: Array) -> Array:
     return solve_oriented(a, b)[0]
 
 
+def determinant(a: Array) -> Array:
+    """Determinant of ``a``, ``(n, n, ...) -> (...)``."""
+    if a.shape[0] == 2:
+        return a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    _, negative, size = _eliminated(a, a[:, :0])
+    return jnp.where(negative, -size, size)
+
+
 def solve_oriented(a: Array, b: Array) -> tuple[Array, Array]:
     """Solution of ``a x = b`` as in :func:`solve`, and flags of a negative determinant of ``a``, ``(...)``."""
+    return _eliminated(a, b)[:2]
+
+
+def _eliminated(a: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Solution of ``a x = b``, and sign (flags of negative ones) and modulus of the determinant of ``a``."""
     n = a.shape[0]
     number = jnp.arange(n).reshape(n, *(1,) * (a.ndim - 2))
 
-    def eliminate(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        system, negative = state
+    def eliminate(k: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        system, negative, size = state
         column = system[:, k]
         pivot = jnp.argmax(jnp.where(number < k, -1.0, jnp.abs(column)), axis=0)
         row = jnp.take_along_axis(system, pivot[None, None], axis=0)[0]
         turned = negative ^ (row[k] < 0) ^ (pivot != k)
+        size = jnp.where(size == 0, 0.0, size * jnp.abs(row[k]))
         row, displaced = row / row[k], system[k]
         at_pivot = number == pivot
         rest = jnp.where(at_pivot[:, None], displaced, system)
         rest = rest - jnp.where(at_pivot, displaced[k], column)[:, None] * row
-        return jnp.where((number == k)[:, None], row, rest), turned
+        return jnp.where((number == k)[:, None], row, rest), turned, size
 
-    start = (jnp.concatenate([a, b], axis=1), jnp.zeros(a.shape[2:], bool))
-    system, negative = jax.lax.fori_loop(0, n, eliminate, start)
-    return system[:, n:], negative
+    start = (jnp.concatenate([a, b], axis=1), jnp.zeros(a.shape[2:], bool), jnp.ones(a.shape[2:]))
+    system, negative, size = jax.lax.fori_loop(0, n, eliminate, start)
+    return system[:, n:], negative, size
 
 
 def spectral_norm(a: Array) -> Array:

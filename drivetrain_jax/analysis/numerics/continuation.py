@@ -1,0 +1,305 @@
+"""Branches of periodic orbits over a parameter, by pseudo-arclength continuation.
+
+A point of a branch is ``x = (y, p)`` with ``F(y; p) = y``, F being the map over one period. Branches run through folds and
+along unstable orbits, and do not end where an orbit loses its stability. Folds (``det(1 - M) = 0``) and period doublings
+(``det(1 + M) = 0``) are located between neighbouring points of a branch. All functions act on lanes: components of x have
+the shape ``(N,)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from drivetrain_jax.analysis.numerics.linear_algebra import determinant, solve
+
+# Newton: most corrections.
+_CORRECTIONS = 8
+# Factors on the step length after a failure and after few corrections, and the number of corrections that counts as few.
+_SHORTER, _LONGER, _FEW = 0.4, 1.4, 4
+_SHORTEST, _CLOSED, _LEAST_COSINE = 1e-7, 1e-9, 0.8
+# Largest distance of a point from its guess relative to the step; on an arc that turns by acos(0.8) it is tan(acos(0.8)/2).
+_ASIDE = 1 / 3
+# Limits so that no pair of folds or doublings hides between two points: largest deviation of a test value (``det(1 -+ M)``)
+# from the line through the last two points, relative to the value; least such value; fraction of the longest step up to
+# which steps are always accepted.
+_BENT, _LEAST_DISTANCE, _FINE = 0.25, 0.02, 0.01
+# Most steps of all motions of a branch.
+_BUDGET = 5e6
+# Locating a fold or doubling: most steps, and size of the last step relative to the chord.
+_ROOT_STEPS, _LOCATED = 40, 1e-13
+# Relative difference below which folds or doublings are the same.
+_SAME = 1e-8
+
+
+class Mapped(NamedTuple):
+    """The map over a period at ``x``: the state at its ``end`` (n, N), the derivatives of the end by the state, ``matrix``
+    (n, n, N), and by the parameter, ``slope`` (n, N), and the ``steps`` (N,) of the motions."""
+
+    end: Array
+    matrix: Array
+    slope: Array
+    steps: Array
+
+
+PeriodMap = Callable[[Array], Mapped]
+
+
+class Branch(NamedTuple):
+    """Points along a branch: ``x`` of shape ``(points, n + 1, N)`` and transition matrices of shape ``(n, n, points, N)``.
+    After the last point of a lane they are NaN."""
+
+    x: Array
+    matrix: Array
+
+
+class _Solved(NamedTuple):
+    """An orbit: ``x``, its transition matrix, the unit tangent of the branch, and the work of Newton's method."""
+
+    x: Array
+    matrix: Array
+    tangent: Array
+    corrections: Array
+    change: Array
+    steps: Array
+
+
+def _bordered(matrix: Array, slope: Array, row: Array, scale: Array) -> Array:
+    """Derivatives of ``F(y; p) - y`` in units of ``scale``, with ``row`` as last row, ``(n + 1, n + 1, N)``."""
+    inner = matrix - jnp.eye(matrix.shape[0])[:, :, None]
+    rows = jnp.concatenate([inner, slope[:, None]], axis=1) * scale / scale[:-1, None]
+    return jnp.concatenate([rows, jnp.broadcast_to(row, scale.shape)[None]])
+
+
+def _on_plane(period_map: PeriodMap, guess: Array, normal: Array, scale: Array, converged: float) -> _Solved:
+    """The orbit on the plane through ``guess`` with the given ``normal`` (in units of ``scale``), by Newton's method."""
+    n, lanes = guess.shape[0] - 1, guess.shape[1]
+
+    def going(state: tuple[Array, _Solved]) -> Array:
+        count, solved = state
+        return (count < _CORRECTIONS) & jnp.any(solved.change > converged)
+
+    def correct(state: tuple[Array, _Solved]) -> tuple[Array, _Solved]:
+        count, old = state
+        found = period_map(old.x)
+        ahead = jnp.sum(normal * (guess - old.x) / scale, axis=0)
+        right = jnp.concatenate([(old.x[:-1] - found.end) / scale[:-1], ahead[None]])
+        system = _bordered(found.matrix, found.slope, normal, scale)
+        step, along = jnp.moveaxis(solve(system, jnp.stack([right, last], axis=1)), 1, 0)
+        tangent = along / jnp.sqrt(jnp.sum(along**2, axis=0))
+        change = jnp.max(jnp.abs(step), axis=0)
+        open_ = old.change > converged
+        new = _Solved(old.x + step * scale, found.matrix, tangent, old.corrections + 1, change, old.steps + found.steps)
+        return count + 1, jax.tree.map(lambda a, b: jnp.where(open_, a, b), new, old)
+
+    zero = jnp.zeros(lanes)
+    last = jnp.zeros_like(guess).at[-1].set(1.0)
+    first = _Solved(guess, jnp.zeros((n, n, lanes)), last, jnp.zeros(lanes, jnp.int32), zero + jnp.inf, zero)
+    return jax.lax.while_loop(going, correct, (jnp.asarray(0), first))[1]
+
+
+class _Front(NamedTuple):
+    """The last orbit, the length of the next step, the number of the orbit on the branch, the last change of both test
+    values, ``(2, N)``, and the steps of all motions."""
+
+    solved: _Solved
+    length: Array
+    number: Array
+    change: Array
+    spent: Array
+
+
+def follow(
+    period_map: PeriodMap,
+    x: Array,
+    scale: Array,
+    *,
+    direction: Array,
+    attempts: int,
+    longest: float = 0.05,
+    limits: tuple[Array | float, Array | float] = (0.0, np.inf),
+    converged: float = 1e-12,
+    special: bool = True,
+) -> Branch:
+    """The branch of orbits through ``x = (y, p)``, shape ``(n + 1, N)``.
+
+    ``x`` is a guess for the first point, whose parameter is kept. ``direction`` (+1, -1), a number or of shape ``(N,)``, is
+    the initial direction of p. The branch ends beyond the ``limits`` of p, after ``attempts`` steps, failed ones included,
+    or when its motions have taken 5e6 steps. ``longest`` is the longest step, in units of ``scale`` (n + 1, N).
+    ``converged`` is the size of the last Newton correction. If ``special``, no pair of folds or doublings hides between two
+    points.
+    """
+    closed = max(converged, _CLOSED)
+    rise = jnp.zeros_like(x).at[-1].set(direction)
+    first = _on_plane(period_map, x, rise, scale, converged)
+    first = first._replace(x=jnp.where(first.change <= closed, first.x.at[-1].set(x[-1]), jnp.nan))
+    lanes = jnp.arange(x.shape[1])
+    store = jnp.full((attempts, _row(first).shape[0], x.shape[1]), jnp.nan).at[0].set(_row(first))
+
+    def step(state: tuple[Array, _Front, Array]) -> tuple[Array, _Front, Array]:
+        count, front, store = state
+        guess = jnp.where(_going(front, limits), front.solved.x + front.length * front.solved.tangent * scale, jnp.nan)
+        there = _on_plane(period_map, guess, front.solved.tangent, scale, converged)
+        aside = jnp.sqrt(jnp.sum(((there.x - guess) / scale) ** 2, axis=0))
+        good = (aside <= _ASIDE * front.length) & (there.change <= closed) & (there.x[-1] > 0)
+        good &= jnp.sum(there.tangent * front.solved.tangent, axis=0) > _LEAST_COSINE
+        good &= (front.length <= _FINE * longest) | _straight(front, there) | (not special)
+        front = _moved(front, there, good, longest, limits)
+        return count + 1, front, store.at[front.number, :, lanes].set(_row(front.solved).T)
+
+    def unfinished(state: tuple[Array, _Front, Array]) -> Array:
+        return (state[0] < attempts) & jnp.any(_going(state[1], limits))
+
+    begin = _Front(
+        first,
+        jnp.full(lanes.shape, longest),
+        jnp.zeros_like(lanes),
+        jnp.zeros((2, lanes.size)),
+        first.steps,
+    )
+    *_, store = jax.lax.while_loop(unfinished, step, (jnp.asarray(1), begin, store))
+    n = x.shape[0] - 1
+    matrix = jnp.moveaxis(store[:, n + 1 :], 1, 0)
+    return Branch(store[:, : n + 1], matrix.reshape(n, n, *matrix.shape[1:]))
+
+
+def _row(solved: _Solved) -> Array:
+    """The stored values of a point of a branch, ``(n + 1 + n^2, N)``."""
+    return jnp.concatenate([solved.x, solved.matrix.reshape(-1, solved.x.shape[1])])
+
+
+def _going(front: _Front, limits: tuple[Array | float, Array | float]) -> Array:
+    """Flags of branches that have not ended; the others do not move."""
+    p = front.solved.x[-1]
+    return (p >= limits[0]) & (p <= limits[1]) & (front.length > _SHORTEST) & (front.spent <= _BUDGET)
+
+
+def _tests(matrix: Array) -> Array:
+    return jnp.stack([fold_test(matrix), doubling_test(matrix)])
+
+
+def _straight(front: _Front, there: _Solved) -> Array:
+    """True if both tests change so steadily that no pair of folds or doublings hides between the last two points."""
+    old, new = _tests(front.solved.matrix), _tests(there.matrix)
+    bent = jnp.abs(new - old - front.change * front.length)
+    least = jnp.maximum(jnp.minimum(jnp.abs(old), jnp.abs(new)), _LEAST_DISTANCE)
+    return jnp.all(bent <= _BENT * least, axis=0)
+
+
+def _moved(
+    front: _Front,
+    there: _Solved,
+    good: Array,
+    longest: float,
+    limits: tuple[Array | float, Array | float],
+) -> _Front:
+    """The front at ``there`` where it is ``good``, or else the old one with a shorter step.
+
+    A point that is not near the tangent may lie on another part of the branch, or on another branch.
+    """
+    longer = jnp.minimum(jnp.where(there.corrections <= _FEW, _LONGER, 1.0) * front.length, longest)
+    moved = good & _going(front, limits)
+    change = (_tests(there.matrix) - _tests(front.solved.matrix)) / front.length
+    return _Front(
+        jax.tree.map(lambda new, old: jnp.where(moved, new, old), there, front.solved),
+        jnp.where(good, longer, _SHORTER * front.length),
+        front.number + moved,
+        jnp.where(moved, change, front.change),
+        front.spent + there.steps,
+    )
+
+
+def _shifted(matrix: Array, sign: float) -> Array:
+    return determinant(jnp.eye(matrix.shape[0]).reshape(*matrix.shape[:2], *(1,) * (matrix.ndim - 2)) + sign * matrix)
+
+
+def fold_test(matrix: Array) -> Array:
+    """``det(1 - M)`` of matrices ``(n, n, ...)``: zero where a multiplier is 1."""
+    return _shifted(matrix, -1.0)
+
+
+def doubling_test(matrix: Array) -> Array:
+    """``det(1 + M)`` of matrices ``(n, n, ...)``: zero where a multiplier is -1."""
+    return _shifted(matrix, 1.0)
+
+
+def locate(period_map: PeriodMap, ends: tuple[Array, Array], tests: tuple[Array, Array], doubling: Array) -> Array:
+    """``x`` at a fold or (where ``doubling``) a period doubling between two points of a branch, in every lane.
+
+    ``ends`` are x before and after the sign change of the test, shape ``(n + 1, N)`` each; ``tests`` are the values of the
+    test there. The method is the Illinois variant of the secant method on planes across the chord. NaN where the ends are
+    NaN, and where no orbit was found between them.
+    """
+    chord = ends[1] - ends[0]
+    scale = jnp.abs(ends[0]) + jnp.abs(ends[1])
+    normal = chord / scale
+    span = jnp.sum(normal**2, axis=0)
+
+    def narrow(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        count, a, fa, b, fb, _, _ = state
+        part = jnp.where(fb == fa, (a + b) / 2, b - fb * (b - a) / jnp.where(fb == fa, 1.0, fb - fa))
+        solved = _on_plane(period_map, ends[0] + part * chord, normal, scale, 1e-12)
+        f = jnp.where(doubling, doubling_test(solved.matrix), fold_test(solved.matrix))
+        opposite = f * fb < 0
+        settled = jnp.abs(part - b) <= _LOCATED
+        bracket = (jnp.where(opposite, b, a), jnp.where(opposite, fb, fa / 2), part, f)
+        between = (solved.change <= _CLOSED) & (
+            jnp.sum(((solved.x - ends[0] - part * chord) / scale) ** 2, axis=0) <= span
+        )
+        return count + 1, *bracket, jnp.where(between, solved.x, jnp.nan), settled
+
+    def unfinished(state: tuple[Array, ...]) -> Array:
+        return (state[0] < _ROOT_STEPS) & jnp.any(~state[-1] & jnp.isfinite(state[2] + state[4]))
+
+    zero, lanes = jnp.zeros(chord.shape[1]), jnp.zeros(chord.shape[1], bool)
+    state = (jnp.asarray(0), zero, tests[0], zero + 1, tests[1], ends[0] + jnp.nan, lanes)
+    return jax.lax.while_loop(unfinished, narrow, state)[5]
+
+
+def folds_and_doublings(
+    map_of: Callable[[Array], PeriodMap], found: Branch, limits: tuple[float, float], each: int, most: int, parts: int
+) -> tuple[Array, Array]:
+    """Parameters of folds and period doublings within the limits, ``(2, most, N)``: of each the largest ones, rising, NaN
+    after the last one.
+
+    ``found`` has ``parts N`` lanes, the parts of every line N apart, and up to ``each`` of both kinds on a part. What
+    several parts have in common counts once.
+    ``map_of(index)`` is the period map of the lanes ``index``. The second result, ``(N,)``, is true if all were located, and
+    there are no others.
+    """
+    tests = _tests(found.matrix)
+    changes = (tests[:, 1:] * tests[:, :-1] < 0).transpose(1, 0, 2)
+    lanes = changes.shape[2]
+
+    # One more than are located, to detect further ones.
+    above = jnp.maximum(found.x[1:, -1], found.x[:-1, -1])[:, None]
+    above = jnp.where(changes, above, -jnp.inf)
+    place = jnp.argsort(-above, axis=0)[: each + 1]
+    exists = jnp.take_along_axis(changes, place, axis=0)
+    column = jnp.broadcast_to(jnp.arange(lanes), place.shape)
+    kind = jnp.broadcast_to(jnp.arange(2)[:, None], place.shape)
+
+    def at(shift: int) -> tuple[Array, Array]:
+        x = jnp.where(exists[:, :, None], jnp.moveaxis(found.x[place + shift, :, column], -1, 2), jnp.nan)
+        value = jnp.where(exists, tests[kind, place + shift, column], jnp.nan)
+        return jnp.moveaxis(x, 2, 0).reshape(found.x.shape[1], -1), value.reshape(-1)
+
+    (before, first), (after, second) = at(0), at(1)
+    x = locate(map_of(column.reshape(-1)), (before, after), (first, second), kind.reshape(-1) == 1)
+    p = x[-1].reshape(place.shape)
+    lost = jnp.any(exists & jnp.isnan(p), axis=(0, 1)).reshape(parts, -1).any(axis=0)
+    p = jnp.where((p >= limits[0]) & (p <= limits[1]), p, -jnp.inf)
+    more = jnp.any(jnp.isfinite(p[each]), axis=0).reshape(parts, -1).any(axis=0)
+    # Join the parts of a line, select the largest parameters, then sort them.
+    p = jnp.moveaxis(p.reshape(-1, 2, parts, lanes // parts), 2, 0).reshape(-1, 2, lanes // parts)
+    falling = -jnp.sort(-p, axis=0)
+    again = jnp.diff(falling, axis=0) >= -_SAME * falling[1:]
+    falling = -jnp.sort(-falling.at[1:].set(jnp.where(again, -jnp.inf, falling[1:])), axis=0)
+    more |= jnp.any(jnp.isfinite(falling[most:]), axis=(0, 1))
+    rising = jnp.sort(jnp.where(jnp.isinf(falling[:most]), jnp.nan, falling[:most]), axis=0)
+    return jnp.moveaxis(rising, 1, 0), ~lost & ~more
