@@ -203,23 +203,26 @@ def forced_section() -> str:
     cases = ((0.8, 1.3), (0.5236, 1.416), (0.5, 0.72))
     points = {"beta": [b for b, _ in cases], "Omega": [o for _, o in cases]}
     about_zero = package_points("floquet", ["spectral_radius"], points).spectral_radius.values
-    outputs = ["amplitude", "orbit_amplitude", "orbit_spectral_radius"]
+    outputs = ["amplitude", "orbit_state", "orbit_amplitude", "orbit_spectral_radius", "orbit_count"]
     ours = package_points("forced", outputs, points)
     rows = []
     for i, (beta, omega) in enumerate(cases):
         p = BASE_CASE | {"beta": beta, "Omega": omega}
-        linear, (_, amplitude, rho) = linear_response(p)[1], nonlinear_orbit(p)
+        # Two digits decide which one of several orbits Newton's method finds.
+        near = np.round(ours.orbit_state[i].values, 2)
+        linear, (_, amplitude, rho) = linear_response(p)[1], nonlinear_orbit(p, near)
         at = f"({beta:g}, {omega:g})"
         rows += [
             [f"{at} rho about theta = 0", f"{about_zero[i]:.8f}", f"{spectral_radius(monodromy(p)):.8f}"],
+            [f"{at} nonlinear orbits found", f"{int(ours.orbit_count[i])}", ""],
             [f"{at} rho about the nonlinear orbit", f"{float(ours.orbit_spectral_radius[i]):.8f}", f"{rho:.8f}"],
             [f"{at} linear amplitudes / rad", _pair(ours.amplitude[i].values), _pair(linear)],
             [f"{at} amplitudes of the orbit / rad", _pair(ours.orbit_amplitude[i].values), _pair(amplitude)],
         ]
     text = (
         "The paper keeps the forcing (0, -eta')^T in (15), but judges stability by the homogeneous part, about "
-        "theta = 0. The shaft moves along the forced periodic orbit instead. Where the verdicts differ, that of the "
-        "orbit is right. The paper publishes no values here.\n"
+        "theta = 0. The shaft moves along a forced periodic orbit instead. Where several orbits coexist, the values are "
+        "those of the smallest stable one, or of the smallest one if none is stable. The paper publishes no values here.\n"
     )
     return (
         "## Forced response and the true orbit\n\n"

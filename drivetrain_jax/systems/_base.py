@@ -222,6 +222,11 @@ class System(eqx.Module):
         return cls(**{name: value for name, value in found.items() if name not in cls.physical.names})
 
     @classmethod
+    def unit_of_time(cls) -> str:
+        """The unit of times in results and options; a time without unit is the angle of a shaft, in rad."""
+        return "rad" if cls.time_units == "1" else cls.time_units
+
+    @classmethod
     def role(cls, name: str) -> str:
         """The parameter with the role ``name``; :class:`~drivetrain_jax.InputError` if there is none."""
         if name not in cls.roles:

@@ -51,6 +51,7 @@ class Rattle(System):
     presets = PRESETS
     resonances = THRESHOLD
     physical = PHYSICAL
+    time_units = "s"
     roles = MappingProxyType({"speed": "omega", "initial_displacement": "u0", "initial_rate": "v0", "half_play": "b"})
     state = (
         Component("u", "m", "relative displacement"),

@@ -136,7 +136,6 @@ def largest(function):
 KNOWN_ORBITS = [
     (0.8, 1.3, 1.18959556, (-5.14637547e-4, 1.54887525e-4, -6.40359719e-2, 0.348507717), (0.03629, 0.21586)),
     (0.5236, 1.416, 1.11394778, None, None),
-    (0.5, 0.72, 1.00023, None, None),
 ]
 
 
@@ -202,9 +201,29 @@ def test_nonlinear_orbit_against_scipy(point, beta, omega, zeta):
 
 
 def test_branch_followed_around_folds(point):
-    """At the forced resonance (linear amplitude 17 rad) several orbits exist; short strides lead to this one."""
-    state = point(beta=0.5, Omega=0.709)["orbit_state"]
-    np.testing.assert_allclose(state, (-0.033234763, 0.029779093, 0.983894762, -0.745979437), atol=2e-9)
+    """At the forced resonance (linear amplitude 17 rad) several orbits exist; the smallest stable one is this one."""
+    result = point(beta=0.5, Omega=0.709)
+    np.testing.assert_allclose(result["orbit_state"], (-0.033234763, 0.029779093, 0.983894762, -0.745979437), atol=2e-9)
+    assert result["orbit_count"] >= 2
+
+
+@pytest.mark.parametrize(
+    ("beta", "omega", "radius", "largest"),
+    [(0.55, 0.725, 0.999893, 0.7332783), (0.925, 0.725, 0.999982, 0.5534705), (0.975, 0.725, 0.999983, 0.5441110)],
+)
+def test_a_stable_orbit_is_reported_where_one_exists(point, beta, omega, radius, largest):
+    """The orbits on the path of growing forcing are unstable; continuation by another code found these."""
+    result = point(beta=beta, Omega=omega)
+    assert result["orbit_spectral_radius"] == pytest.approx(radius, abs=1e-6)
+    assert result["orbit_amplitude"].max() == pytest.approx(largest, abs=1e-7)
+    assert result["orbit_count"] >= 2 and result["outcome"] == Outcome.SUCCESS
+    disks = Disks(beta=beta, Omega=omega)
+    start = disks.periodic_nonlinear(disks.to_disks(np.round(result["orbit_state"], 3)))
+    np.testing.assert_allclose(result["orbit_state"], disks.to_angles(start), atol=2e-9)
+
+
+def test_one_orbit_away_from_resonances(point):
+    assert point(beta=0.8, Omega=1.3)["orbit_count"] == 1
 
 
 def test_no_forcing_without_joint_angle(point):
@@ -240,10 +259,11 @@ def test_error_beyond_the_target_is_reported(point):
 
 @pytest.mark.full
 def test_lost_orbit_keeps_the_linear_response(point, monkeypatch):
-    """The orbit needs several corrections, so a limit of one correction loses it."""
+    """The orbit needs several corrections, on the path and near a guess, so that limits lose it."""
     solve = quick_jit(lambda v: solver(("periodic_state", "orbit_state", "orbit_state_error")).solve(v, 0))
     with monkeypatch.context() as patch:
         patch.setattr(orbit, "MAX_CORRECTIONS", 1)
+        patch.setattr(orbit, "MAX_POLISH", 0)
         result = solve({k: np.float64(v) for k, v in (BASE | {"beta": 0.5, "Omega": 0.72}).items()})
     assert result["outcome"] == Outcome.NOT_CONVERGED
     assert np.all(np.isnan(result["orbit_state"])) and np.isnan(result["orbit_state_error"])

@@ -58,13 +58,15 @@ def linear_response(p: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
     return start, _amplitude(linear_field, start, point)
 
 
-def nonlinear_orbit(p: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, float]:
-    """State at tau = 0, amplitude and spectral radius of the nonlinear periodic orbit next to the linear response.
+def nonlinear_orbit(p: Mapping[str, float], guess: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, float]:
+    """State at tau = 0, amplitude and spectral radius of the nonlinear periodic orbit next to ``guess``.
+
+    The default of ``guess`` is the linear response.
 
     Newton on the return map with its Jacobian by fourth-order differences (error of the multipliers about 1e-9).
     """
     point = geometry(p)
-    y = linear_response(p)[0]
+    y = linear_response(p)[0] if guess is None else guess
     for _ in range(12):
         jacobian = _jacobian(y, point)
         step = np.linalg.solve(jacobian - np.eye(4), _flow(nonlinear_field, y, point) - y)

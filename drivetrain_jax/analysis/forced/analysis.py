@@ -1,8 +1,10 @@
 """Forced response: periodic solution of the linearised system, and the nonlinear periodic orbit with its multipliers.
 
 Linear: the variational equations over one period T from rest give ``y(T; y0) = r + Z y0``, hence ``y0 = (I - Z)^-1 r``.
-Nonlinear: Newton shooting along growing forcing (:func:`~drivetrain_jax.analysis.forced.orbit.shoot`). If several orbits
-exist, the result is the first one on this path.
+Nonlinear: Newton shooting along growing forcing (:func:`~drivetrain_jax.analysis.forced.orbit.shoot`), and along the speed
+of the system, if it has one, from below and from above (:mod:`~drivetrain_jax.analysis.forced.coexisting`). Of several
+orbits the result is the stable one of the smallest amplitude, or the smallest one if none is stable; ``orbit_count`` is
+their number. Orbits on branches that these paths do not meet are not found.
 
 Outcome: ``TOLERANCE_NOT_MET`` if the estimated error of a state exceeds ``rtol`` times its largest entry; ``NOT_CONVERGED``
 if I - Z is singular to working accuracy or no nonlinear orbit was found. Only missing results are NaN: without an orbit, a
@@ -12,6 +14,7 @@ finite linear response and ``condition`` are kept.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -25,10 +28,12 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver, forward_derivatives
 from drivetrain_jax.analysis.forced.amplitude import amplitudes
+from drivetrain_jax.analysis.forced.coexisting import neighbours
 from drivetrain_jax.analysis.forced.orbit import (
     Field,
     Orbit,
     Transition,
+    corrected,
     in_units_of,
     integrate,
     newton_step,
@@ -62,6 +67,8 @@ LOOSEST = 1e-6
 SINGULAR_SHARPNESS = 1e-11
 # Relative error above which a periodic solution counts as not found.
 NOT_FOUND = 1e-2
+# Largest excess of a spectral radius over 1 by rounding, and relative difference of states of one orbit.
+STABLE_MARGIN, SAME = 1e-8, 1e-6
 FORCING_SAMPLES = 64
 # Points per chunk: of the linear response, and of orbits. One orbit with hundreds of corrections delays all in its chunk.
 CHUNK, ORBITS_CHUNK = 128, 16
@@ -152,50 +159,97 @@ def _condition(matrix: Array) -> Array:
     return jnp.where(jnp.all(jnp.isfinite(inverse)), condition, jnp.inf)
 
 
-def nonlinear_orbit(
-    model: ForcedModel, response: Response, rtol: float, with_amplitude: bool
-) -> tuple[Orbit, Array | None, Array | None]:
-    """Nonlinear periodic orbit on the path that starts along ``response``, its amplitude, and the phase of the amplitude.
+class Found(NamedTuple):
+    """An orbit, the largest displacements on it with their phases (k,), its spectral radius, and the number of different
+    orbits at the point."""
 
-    Without a ``response`` the orbit is NaN and has the outcome of ``response``. Amplitude and phase are None unless
-    requested.
+    orbit: Orbit
+    largest: Array
+    phase: Array
+    radius: Array
+    count: Array  # pyright: ignore[reportIncompatibleMethodOverride]
+
+
+def nonlinear_orbit(model: ForcedModel, response: Response, rtol: float, others: Array) -> Found:
+    """The stable periodic orbit of the smallest amplitude, or the smallest one if none is stable.
+
+    The orbits are that on the path that starts along ``response``, and those near the states ``others`` (m, n). Without a
+    ``response`` the orbit is NaN and has the outcome of ``response``.
     """
     usable = response.outcome < Outcome.NOT_CONVERGED
     start = jnp.where(usable, response.state, 0.0)
     # Nonlinearity matters for states of order one; a smaller response is measured in units of its own size.
-    unit = jnp.minimum(size_of(start), 1.0)
-    orbit = shoot(in_units_of(unit, model.field), start / unit, model.period, _sharpness(rtol, TRANSITION_SHARPNESS))
-    outcome = jnp.where(usable, orbit.outcome, response.outcome)
-    state = jnp.where(outcome < Outcome.NOT_CONVERGED, unit * orbit.state, 0.0)
+    unit, sharp = jnp.minimum(size_of(start), 1.0), _sharpness(rtol, TRANSITION_SHARPNESS)
+    first = shoot(in_units_of(unit, model.field), start / unit, model.period, sharp)
+    first = first._replace(
+        state=unit * first.state, error=unit * first.error, outcome=jnp.where(usable, first.outcome, response.outcome)
+    )
+    others = jnp.where(usable, others, jnp.nan)
+    first = jax.tree.map(lambda x: jnp.asarray(x)[None], _finished(model, rtol, first))
+    every = jax.tree.map(lambda *x: jnp.concatenate(x), first, orbits_near(model, others, rtol))
+    found = every.orbit.outcome < Outcome.NOT_CONVERGED
+    unstable = every.radius > 1 + STABLE_MARGIN
+    best = jnp.lexsort((jnp.max(every.largest, axis=1), unstable, ~found))[0]
+    return jax.tree.map(lambda x: x[jnp.where(jnp.any(found), best, 0)], every)._replace(
+        count=jnp.sum(distinct(every.orbit.state, SAME))
+    )
+
+
+def distinct(states: Array, near: float) -> Array:
+    """Flags of the states (m, n) that are not NaN and not, up to ``near`` times their size, one of those before them."""
+    apart = jnp.max(jnp.abs(states[:, None] - states[None]), axis=2)
+    same = jnp.tril(apart <= near * jax.vmap(size_of)(states)[:, None], -1)
+    return jnp.isfinite(states[:, 0]) & ~jnp.any(same, axis=1)
+
+
+def orbits_near(model: ForcedModel, guesses: Array, rtol: float) -> Found:
+    """The orbits to which Newton's method leads from ``guesses`` (m, n), as results of m orbits; NaN where there is none."""
+    sharp = _sharpness(rtol, TRANSITION_SHARPNESS)
+    orbits = jax.vmap(lambda guess: corrected(model.field, guess, model.period, sharp))(guesses)
+    return jax.vmap(partial(_finished, model, rtol))(orbits)
+
+
+def _finished(model: ForcedModel, rtol: float, orbit: Orbit) -> Found:
+    """``orbit`` corrected by its closing error, with its largest displacements and its spectral radius."""
+    found = orbit.outcome < Outcome.NOT_CONVERGED
+    state = jnp.where(found, orbit.state, 0.0)
     size = size_of(state)
     field, sharp = in_units_of(size, model.field), _sharpness(rtol, CLOSING_SHARPNESS)
-    (largest, phase), correction, closed = _closed(model, field, state / size, orbit.matrix, sharp, with_amplitude)
-    error = size * jnp.max(jnp.abs(correction)) + unit * orbit.error
+    # A missing orbit is integrated over an empty span.
+    model = replace(model, period=jnp.where(found, model.period, 0.0))
+    (largest, phase), correction, closed = _closed(model, field, state / size, orbit.matrix, sharp, True)
+    error = size * jnp.max(jnp.abs(correction)) + orbit.error
     missed = jnp.where(error <= rtol * size, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
-    outcome = _worst(outcome, jnp.where(outcome < Outcome.NOT_CONVERGED, _worst(closed, missed), outcome))
-    state, matrix, error, largest, phase = jax.tree.map(
-        lambda x: jnp.where(outcome < Outcome.NOT_CONVERGED, x, jnp.nan),
-        (state, orbit.matrix, error, None if largest is None else size * largest, phase),
+    outcome = _worst(orbit.outcome, jnp.where(found, _worst(closed, missed), orbit.outcome))
+    found = outcome < Outcome.NOT_CONVERGED
+    radius = jnp.max(jnp.hypot(*eigenvalues(jnp.where(found, orbit.matrix, jnp.eye(state.size)))))
+    state, matrix, error, largest, phase, radius = jax.tree.map(
+        lambda x: jnp.where(found, x, jnp.nan), (state, orbit.matrix, error, size * jnp.asarray(largest), phase, radius)
     )
-    return Orbit(state, matrix, error, outcome, orbit.corrections), largest, phase
+    return Found(Orbit(state, matrix, error, outcome, orbit.corrections), largest, phase, radius, found)
 
 
-def _orbit_results(
-    model: ForcedModel, response: Response, outputs: tuple[str, ...], rtol: float
-) -> tuple[dict[str, Any], Array]:
-    """The requested results of the nonlinear orbit and their outcome."""
-    orbit, largest, phase = nonlinear_orbit(model, response, rtol, not ORBIT_PEAKS.isdisjoint(outputs))
-    found = orbit.outcome < Outcome.NOT_CONVERGED
-    results = {"orbit_state": orbit.state, "orbit_state_error": orbit.error}
-    results |= {"orbit_amplitude": largest, "orbit_amplitude_phase": phase}
-    if "orbit_spectral_radius" in outputs:
-        matrix = jnp.where(found, orbit.matrix, jnp.eye(orbit.state.size))
-        radius = jnp.max(jnp.hypot(*eigenvalues(matrix)))
-        results["orbit_spectral_radius"] = jnp.where(found, radius, jnp.nan)
-    return results, orbit.outcome
+def _orbit_results(model: ForcedModel, response: Response, others: Array, rtol: float) -> tuple[dict[str, Any], Array]:
+    """Results of the nonlinear orbit and their outcome."""
+    found = nonlinear_orbit(model, response, rtol, others)
+    results = {"orbit_state": found.orbit.state, "orbit_state_error": found.orbit.error}
+    results |= {"orbit_amplitude": found.largest, "orbit_amplitude_phase": found.phase}
+    results |= {"orbit_spectral_radius": found.radius, "orbit_count": found.count.astype(jnp.int32)}
+    return results, found.orbit.outcome
 
 
-def _solve(build: Build, n: int, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+def _others(build: Build, n: int, speed: str, values: Mapping[str, Any]) -> Array:
+    """Approximate orbits at the point that the search along the parameter ``speed`` finds, ``(m, n)``; none without one."""
+    if values.get(speed) is None:
+        return jnp.zeros((0, n))
+    # Newton's method gives the derivatives of the orbits.
+    fixed = jax.tree.map(jax.lax.stop_gradient, dict(values))
+    return neighbours(lambda value: build(fixed | {speed: value}), jnp.asarray(fixed[speed], float), n)
+
+
+def _solve(
+    build: Build, n: int, speed: str, request: Request, values: Mapping[str, Any], effort: Array
+) -> dict[str, Array]:
     """All requested results of one point; ``effort`` only orders the batches, as every integration is adaptive."""
     del effort
     model, rtol = build(values), request.options["rtol"]
@@ -208,7 +262,7 @@ def _solve(build: Build, n: int, request: Request, values: Mapping[str, Any], ef
             response.step.outcome == Outcome.SUCCESS, _condition(response.step.matrix), jnp.nan
         )
     if not set(request.outputs) <= set(LINEAR):
-        of_orbit, orbit_outcome = _orbit_results(model, response, request.outputs, rtol)
+        of_orbit, orbit_outcome = _orbit_results(model, response, _others(build, n, speed, values), rtol)
         results |= of_orbit
         outcome = _worst(outcome, orbit_outcome)
     return {name: results[name] for name in request.outputs} | {"outcome": outcome.astype(jnp.int8)}
@@ -240,7 +294,7 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     build, n = system.models["forced"].build, len(system.state)
     steps = partial(predicted_steps, build, n, len(_displacements(system).values))
     chunk = CHUNK if set(request.outputs) <= set(LINEAR) else ORBITS_CHUNK
-    solve = over_lanes(partial(_solve, build, n, request))
+    solve = over_lanes(partial(_solve, build, n, system.roles.get("speed", ""), request))
     return (Solver("diffrax", solve, steps, chunk=chunk, march=True, short_loops=True),)
 
 
@@ -306,8 +360,7 @@ def _of_system(system: type[System]) -> dict[str, Any]:
     """The variables, in the units of the system's state."""
     units, length = ", ".join(dict.fromkeys(c.units for c in system.state)), system.state[0].units
     each, state = (_displacements(system).name,), ("state",)
-    # A time without unit is the angle of a shaft.
-    time = "rad" if system.time_units == "1" else system.time_units
+    time = system.unit_of_time()
     variables = (
         Variable("periodic_state", units, "periodic solution of the linear system at the start of a period", state),
         Variable("periodic_state_error", units, "estimated absolute error of periodic_state"),
@@ -319,6 +372,7 @@ def _of_system(system: type[System]) -> dict[str, Any]:
         Variable("orbit_amplitude", length, "largest displacement over the period, nonlinear orbit", each),
         Variable("orbit_amplitude_phase", time, "time at which the displacement is largest, nonlinear orbit", each),
         Variable("orbit_spectral_radius", "1", "spectral radius of the monodromy matrix about the nonlinear orbit"),
+        Variable("orbit_count", "1", "number of different nonlinear orbits found (0: none)", dtype="int32"),
     )
     return {"variables": variables}
 

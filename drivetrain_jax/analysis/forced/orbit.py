@@ -43,6 +43,8 @@ WAYPOINT_GOAL = 1e-4
 WAYPOINT_RTOL = 1e-9
 # Size below which corrections that no longer shrink are at the limit of rounding.
 STALLED = 1e-6
+# Most corrections of an orbit that is known approximately, and size of the first one; each halves this limit.
+MAX_POLISH, NEAR = 10, 0.1
 
 
 class Transition(NamedTuple):
@@ -99,8 +101,10 @@ def integrate(field: Field, start: Array, period: Array | float, rtol: Array | f
     return _integrated(field, start, period, rtol)[:2]
 
 
-def _integrated(field: Field, start: Array, period: Array | float, rtol: Array | float) -> tuple[Array, Array, Array]:
-    """The results of :func:`integrate`, and the number of steps."""
+def _integrated(
+    field: Field, start: Array, period: Array | float, rtol: Array | float, most: int = MAX_STEPS
+) -> tuple[Array, Array, Array]:
+    """The results of :func:`integrate` with ``most`` steps, and the number of steps."""
     import diffrax
 
     solution = diffrax.diffeqsolve(
@@ -112,7 +116,7 @@ def _integrated(field: Field, start: Array, period: Array | float, rtol: Array |
         start,
         stepsize_controller=controller(period, rtol),  # pyright: ignore[reportArgumentType]
         adjoint=diffrax.ForwardMode(),
-        max_steps=MAX_STEPS,
+        max_steps=most,
         throw=False,
     )
     end = solution.ys[-1]  # pyright: ignore[reportOptionalSubscript]
@@ -122,16 +126,44 @@ def _integrated(field: Field, start: Array, period: Array | float, rtol: Array |
     return end, outcome, solution.stats["num_steps"]
 
 
-def transition(field: Field, start: Array, period: Array | float, rtol: Array | float) -> Transition:
+def transition(
+    field: Field, start: Array, period: Array | float, rtol: Array | float, most: int = MAX_STEPS
+) -> Transition:
     """Map over one period at ``start`` (entries of order one) and its derivative, by the variational equations."""
     columns = jnp.concatenate([start[:, None], jnp.eye(start.size)], axis=1)
-    end, outcome, steps = _integrated(variational(field), columns, period, rtol)
+    end, outcome, steps = _integrated(variational(field), columns, period, rtol, most)
     return Transition(end[:, 0], end[:, 1:], outcome, steps)
 
 
 def newton_step(step: Transition, start: Array) -> Array:
     """Newton correction of ``start`` towards the fixed point of the map: ``(I - Z)^-1 (end - start)``."""
     return solve(jnp.eye(start.size) - step.matrix, (step.end - start)[:, None])[:, 0]
+
+
+def corrected(field: Field, guess: Array, period: float, rtol: float) -> Orbit:
+    """Periodic orbit near ``guess`` by Newton's method; ``NOT_CONVERGED`` if it leads nowhere or ``guess`` is NaN."""
+    n = guess.size
+
+    def running(s: Orbit) -> Array:
+        near = (s.error <= NEAR * 0.5**s.corrections) & jnp.all(jnp.isfinite(s.state))
+        return (s.outcome == Outcome.NOT_CONVERGED) & (s.corrections < MAX_POLISH) & near
+
+    def correct(s: Orbit) -> Orbit:
+        step = transition(field, s.state, jnp.where(running(s), period, 0.0), rtol)
+        delta = newton_step(step, s.state)
+        change = jnp.max(jnp.abs(delta))
+        done = (step.outcome == Outcome.SUCCESS) & _settled(change / size_of(s.state), change / s.error, rtol)
+        outcome = jnp.where(done, Outcome.SUCCESS, Outcome.NOT_CONVERGED)
+        return Orbit(s.state + delta, step.matrix, change, outcome, s.corrections + 1)
+
+    none = jnp.asarray(Outcome.NOT_CONVERGED)
+    first = Orbit(guess, jnp.full((n, n), jnp.nan), jnp.asarray(NEAR), none, jnp.zeros((), int))
+    return jax.lax.while_loop(running, correct, first)
+
+
+def _settled(relative: Array, shrunk: Array, rtol: float) -> Array:
+    """True after the last correction: of the size of the tolerance, or of that of rounding and no longer shrinking."""
+    return (relative <= rtol) | ((relative <= STALLED) & ~(shrunk <= 0.1))
 
 
 class _Path(NamedTuple):
@@ -228,7 +260,7 @@ def _judge(s: _Path, delta: Array, direction: Array, step: Transition, rtol: flo
     shrinking = (change <= 0.5 * s.correction) & (direction @ s.tangent >= TURN)
     sound = (step.outcome == Outcome.SUCCESS) & jnp.isfinite(change)
     relative = change / size_of(point[:-1])
-    settled = (relative <= rtol) | ((relative <= STALLED) & ~(change <= 0.1 * s.correction))
+    settled = _settled(relative, change / s.correction, rtol)
     close = sound & jnp.where(s.last, settled, shrinking & (change <= WAYPOINT_GOAL))
     n = point.size - 1
     total, matrix = s.total + 1, step.matrix[:n, :n]
