@@ -60,7 +60,8 @@ def forced(system: System, *, outputs: Sequence[str] | None = None, **options: A
 def history(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
     """The components of the state at ``times`` [s], or at ``num`` times from 0 to ``stop``.
 
-    Args as of :func:`floquet`. ``Tripod``: ``phi`` [rad], ``velocity`` [rad/s]. ``Rattle``: ``u`` [m], ``v`` [m/s]; also
+    Args as of :func:`floquet`. ``Tripod``: ``phi`` [rad], ``velocity`` [rad/s]. ``Cardan``: ``theta1``, ``theta2`` and their
+    rates [rad], times in rad of the shaft. ``Rattle``: ``u`` [m], ``v`` [m/s]; also
     ``acceleration``, ``event_time`` [s] and so on; method "slow_flow" gives ``amplitude`` and ``phase``. Outputs over time
     are differentiable, except by "slow_flow".
 
@@ -115,7 +116,8 @@ def steady_state(system: System, *, outputs: Sequence[str] | None = None, **opti
 def frequency_response(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
     """Response along the frequencies ``system.omega`` (L,), swept up and down: ``u_max`` (L, 2) and so on.
 
-    Args as of :func:`floquet`; the frequencies are concrete numbers. Options ``method`` ("exact", "harmonic_balance",
+    ``Cardan``: branches of the forced orbit along ``system.Omega``, ``branch_amplitude`` (L, 7, 2) and so on. Args as of
+    :func:`floquet`; the frequencies are concrete numbers. Options ``method`` ("exact", "harmonic_balance",
     "multiple_scales", "averaging", "describing_function"). No derivatives.
 
     >>> import drivetrain_jax as dt, numpy as np

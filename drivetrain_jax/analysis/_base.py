@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import lru_cache, reduce
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -41,6 +41,7 @@ OUTCOME = Variable(
 RTOL = Parameter("rtol", "1", "target relative error of the results", default=1e-10, lower=1e-14, upper=1e-2)
 # Allowed values of the option `solver`: three explicit solvers of diffrax of order 8 and 5, and a stiff one.
 DIFFRAX_SOLVERS = ("Dopri8", "Dopri5", "Tsit5", "Kvaerno5")
+Quantity = TypeVar("Quantity", Parameter, Variable)
 # Upper limit of simulated time (30 years, in s), and of steps (11 days at a microsecond each).
 MOST_SECONDS, MOST_STEPS = 1e9, 1e12
 
@@ -112,6 +113,13 @@ def finite_results(
 def stacked(jacobian: Any) -> Array:
     """A pytree of derivatives with respect to each parameter as one Jacobian ``(..., P)``."""
     return jnp.stack(jax.tree.leaves(jacobian), axis=-1)
+
+
+def in_time_of(system: type[System], quantities: tuple[Quantity, ...]) -> tuple[Quantity, ...]:
+    """``quantities`` in s and 1/s, in the unit of time of ``system`` instead."""
+    own = system.unit_of_time()
+    units = {"s": own, "1/s": f"1/{own}"}
+    return tuple(replace(each, units=units.get(each.units, each.units)) for each in quantities)
 
 
 def forward_derivatives(

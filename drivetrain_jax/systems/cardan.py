@@ -23,6 +23,7 @@ from jax.tree_util import Partial
 from drivetrain_jax._quantities import Component, Dimension
 from drivetrain_jax.resonances.cardan import RESONANCES
 from drivetrain_jax.systems._base import Number, System, numeric, parameter, serves
+from drivetrain_jax.systems._flow import Components, Flow
 from drivetrain_jax.systems._periodic import SWAP, FloquetModel, ForcedModel, LinearPeriodic
 from drivetrain_jax.systems._rows import Rows
 from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness
@@ -35,6 +36,7 @@ POSITIVE = {"lower": 0.0, "open_lower": True}
 # median of random points with equal steps; its rounding errors are smaller.
 _STRONG = 10.0
 
+_SHAFT = ("beta", "Omega", "zeta", "alpha", "mu", "gamma")
 _BASE_CASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 PRESETS = {"base": _BASE_CASE, "alpha20": _BASE_CASE | {"alpha": 20.0}, "mu20": _BASE_CASE | {"mu": 20.0}}
 
@@ -111,6 +113,10 @@ class Cardan(System):
     alpha: Number = parameter("1", "damping of the driven over the driving shaft, c2/c1", symbol="α", lower=0.0)
     mu: Number = parameter("1", "stiffness of the driven over the driving shaft, k2/k1", symbol="μ", **POSITIVE)
     gamma: Number = parameter("1", "inertia of the driven over the driving disk, J2/J1", symbol="γ", **POSITIVE)
+    theta1_0: Number = parameter("rad", "twist of the driving shaft at tau = 0", default=0.0)
+    theta2_0: Number = parameter("rad", "twist of the driven shaft at tau = 0", default=0.0)
+    theta1_rate_0: Number = parameter("rad", "d theta1/d tau at tau = 0", default=0.0)
+    theta2_rate_0: Number = parameter("rad", "d theta2/d tau at tau = 0", default=0.0)
 
     def vector_field(self, tau: Any, y: Array) -> Array:
         """Nonlinear equations of motion, eqs (2)-(3), as ``y' = f(tau, y)`` with ``y = (theta1, theta2, theta1', theta2')``.
@@ -265,8 +271,8 @@ class Cardan(System):
         """True without damping."""
         return self.zeta == 0
 
-    @serves("atlas", smooth=SMOOTH)
-    @serves("floquet")
+    @serves("atlas", parameters=_SHAFT, smooth=SMOOTH)
+    @serves("floquet", parameters=_SHAFT)
     def floquet_model(self) -> FloquetModel:
         """The linearised shaft in its own coordinates and time, and two equivalent forms over half a period."""
 
@@ -287,7 +293,38 @@ class Cardan(System):
             hamiltonian=own(kind.is_hamiltonian),
         )
 
-    @serves("forced")
+    @serves("history", "lyapunov")
+    def flow(self) -> Flow:
+        """The nonlinear equations, with a strobe every half turn of the driving shaft."""
+
+        def own(method: Callable[..., Any]) -> Partial:
+            return Partial(method, self)
+
+        steepest = jnp.cos(self.beta)
+        largest = 1 / steepest**2 + 1 / self.gamma
+        # Rates where the joint turns fastest: of the motion, of its decay, and of the joint itself.
+        motion = jnp.sqrt(1 + self.mu * largest) / self.Omega
+        decay = 2 * self.zeta / self.Omega * (1 + self.alpha * largest)
+        return Flow(
+            own(type(self)._components),
+            (self.theta1_0, self.theta2_0, self.theta1_rate_0, self.theta2_rate_0),
+            period=math.pi,
+            turns=(1,),
+            divergence=own(type(self)._divergence),
+            fastest=jnp.maximum(jnp.maximum(motion, decay), 2 / steepest),
+        )
+
+    def _components(self, angles: Components, y: Any) -> Components:
+        """The components of ``y'``; the clock turns twice as fast as the shaft."""
+        return tuple(self.vector_field(angles[0] / 2, y))
+
+    def _divergence(self, angles: Components, y: Any) -> Array:
+        """Trace of the Jacobian of the field."""
+        eta, _, _ = speed_ratio(self.beta, angles[0] / 2 + y[0])
+        return jnp.asarray(-2 * self.zeta / self.Omega * (1 + self.alpha * (eta**2 + 1 / self.gamma)))
+
+    @serves("frequency_response", parameters=_SHAFT, returns=ForcedModel)
+    @serves("forced", parameters=_SHAFT)
     def forced_model(self) -> ForcedModel:
         """The nonlinear shaft, and its linearisation with the forcing (0, -eta')."""
         return ForcedModel(self.vector_field, self.linear_field, math.pi, displacements=(0, 1))

@@ -1,4 +1,7 @@
-"""Frequency response of an oscillator with play: motions found by slow sweeps of the drive's frequency, up and down.
+"""Frequency response: motions along the frequency or the speed of the drive.
+
+A system with forced periodic orbits has the branches of these orbits (:mod:`.orbit_branches`). The rest is about an
+oscillator with play: motions found by slow sweeps of the drive's frequency, up and down.
 
 The speed of the system is the path: a line of frequencies is computed as a whole. A sweep starts from rest at the lowest
 (up) or highest (down) frequency and stays on its branch until this ends or becomes unstable; then it jumps to the motion
@@ -24,13 +27,13 @@ from jax import Array
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver, finite_results
-from drivetrain_jax.analysis.frequency_response import closed_form_response, harmonic_response
+from drivetrain_jax.analysis.frequency_response import closed_form_response, harmonic_response, orbit_branches
 from drivetrain_jax.analysis.frequency_response.harmonic_balance import Basis
 from drivetrain_jax.analysis.frequency_response.rules import RULES
 from drivetrain_jax.analysis.impacts import exact_branch, exact_response
 from drivetrain_jax.analysis.impacts.length_unit import from_scaled_length, to_scaled_length
 from drivetrain_jax.analysis.impacts.motion import ABSENT, PHASE, REGIME, REGIMES, STABILITY
-from drivetrain_jax.systems import PiecewiseLinearOscillator, System
+from drivetrain_jax.systems import ForcedModel, PiecewiseLinearOscillator, System
 
 SWEEP = ("sweep_direction",)
 BRANCH = ("branch",)
@@ -224,6 +227,23 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     return (Solver(request.method, partial(_solve, build, request), chunk=_CHUNK),)
 
 
+def _of_system(system: type[System]) -> dict[str, Any]:
+    """The branches of forced orbits, if the model of ``system`` has such."""
+    if system.models["frequency_response"].returns is not ForcedModel:
+        return {}
+    variables = orbit_branches.variables(system)
+    return {
+        "variables": variables,
+        "default_outputs": tuple(v.name for v in variables),
+        "methods": {"continuation": ("rtol",)},
+        "method_titles": {"continuation": "branches of periodic orbits by arc length"},
+        "options": (RTOL,),
+        "patience": "",
+        "solvers": orbit_branches.solvers,
+        "dimensions": orbit_branches.dimensions,
+    }
+
+
 ANALYSIS = Analysis(
     name="frequency_response",
     title="frequency response",
@@ -242,4 +262,5 @@ ANALYSIS = Analysis(
     solvers=_solvers,
     dimensions=_dimensions,
     path_axis=lambda system, _: system.role("speed"),
+    of_system=_of_system,
 )

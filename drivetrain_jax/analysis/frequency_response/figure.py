@@ -15,6 +15,7 @@ from matplotlib.lines import Line2D
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.frequency_response import maps as rattle_maps
+from drivetrain_jax.analysis.frequency_response import orbit_figure
 from drivetrain_jax.view import cells, regimes
 from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import FRAME_GREY, STATE_COLOURS, STYLE, axis_label, in_brackets, units_of
@@ -58,11 +59,13 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
 
     Each of ``dataset`` and ``others`` (results for the same parameters by other methods) may have the speed as its single
     axis. Stable motions are solid lines, unstable ones dashed, jumps of a sweep dotted. One dataset with a second axis
-    gives maps of both sweeps. Raises :class:`InputError` for other axes or parameters, for a method given twice, and if no
-    variable of the figure is stored.
+    gives maps of both sweeps. A dataset of forced orbits shows their branches. Raises :class:`InputError` for other axes or
+    parameters, for a method given twice, and if no variable of the figure is stored.
     """
     with matplotlib.rc_context(STYLE):
         results = [cells.prepare(each) for each in (dataset, *others)]
+        if len(results) == 1 and "branch_amplitude" in dataset:
+            return orbit_figure.plot(results[0], _path(dataset))
         axes = [cells.sweep_axes(each) for each in results]
         if len(results) == 1 and len(axes[0]) == 2:
             return rattle_maps.plot(results[0], axes[0])

@@ -31,6 +31,7 @@ from drivetrain_jax.analysis._base import (
     Request,
     Solver,
     forward_derivatives,
+    in_time_of,
 )
 from drivetrain_jax.analysis.history import piecewise
 from drivetrain_jax.analysis.history.integration import NUM, has_finite_start, integrated, limits_of, requested_times
@@ -80,7 +81,7 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
 
 
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
-    return (Dimension("time", "time", requested_times(request), "s"),)
+    return (Dimension("time", "time", requested_times(request), system.unit_of_time()),)
 
 
 def _of_system(system: type[System]) -> dict[str, Any]:
@@ -104,7 +105,11 @@ def _of_system(system: type[System]) -> dict[str, Any]:
     errors = tuple(
         Variable(f"{c.name}_error", c.units, f"estimated absolute error of {c.name}", ("time",)) for c in system.state
     )
-    return {"variables": values + errors, "default_outputs": names}
+    return {
+        "variables": values + errors,
+        "default_outputs": names,
+        "options": in_time_of(system, ANALYSIS.options),
+    }
 
 
 ANALYSIS = Analysis(

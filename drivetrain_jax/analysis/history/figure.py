@@ -54,8 +54,9 @@ def plot(dataset: xr.Dataset) -> Figure:
 
 
 def _components(dataset: xr.Dataset) -> list[str]:
-    """Names of the first two components of the state, which the figure shows."""
-    return [str(c["name"]) for c in state(dataset)[:2]] or ["displacement", "rate"]
+    """Names of the first displacement and of its rate; displacements are the first half of the state."""
+    names = [str(c["name"]) for c in state(dataset)]
+    return [names[0], names[len(names) // 2]] if names else ["displacement", "rate"]
 
 
 def _single(dataset: xr.Dataset) -> Figure:

@@ -27,7 +27,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis._base import MOST_SECONDS, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis._base import MOST_SECONDS, Analysis, Outcome, Request, Solver, in_time_of
 from drivetrain_jax.analysis.lyapunov.forcing import may_be_chaotic
 from drivetrain_jax.analysis.lyapunov.growth_record import (
     SEGMENTS,
@@ -269,6 +269,15 @@ def _dimensions(*_: Any) -> tuple[Dimension, ...]:
     )
 
 
+def _of_system(system: type[System]) -> dict[str, Any]:
+    """Variables, options and advice in the system's unit of time."""
+    return {
+        "variables": in_time_of(system, VARIABLES),
+        "options": in_time_of(system, OPTIONS),
+        "undecided": f"a longer max_time than {{max_time:g}} {system.unit_of_time()} may decide",
+    }
+
+
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     solve, effort = partial(_solve, system, request), partial(_effort, system, request)
     return (Solver("tangent", solve, effort, chunk=_CHUNK, march=True, lengthy=True),)
@@ -286,5 +295,5 @@ ANALYSIS = Analysis(
     options=OPTIONS,
     solvers=_solvers,
     dimensions=_dimensions,
-    undecided="a longer max_time than {max_time:g} s may decide",
+    of_system=_of_system,
 )
