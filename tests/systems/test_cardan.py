@@ -286,7 +286,7 @@ def test_explicit_steps_grow_with_what_makes_a_point_harder():
 def test_systems_are_found_by_name():
     assert system_names()[0] == "cardan"
     assert SYSTEM.name == "cardan"
-    assert set(SYSTEM.models) == {"floquet", "atlas", "forced"}
+    assert set(SYSTEM.models) == {"floquet", "atlas", "forced", "frequency_response", "history", "lyapunov"}
     with pytest.raises(KeyError, match="allowed is one of cardan"):
         get_system("cardn")
 
