@@ -39,14 +39,8 @@ def with_parameters(
     if physical is None or not (swept or any(name in physical.names for name in fixed)):
         return axes, dict(fixed), {}
     known = _known(system, axes, zipped, fixed)
-    everything, used = physical.converted(known), physical.used(known)
+    everything = physical.all_converted(known)
     found = {name: value for name, value in everything.items() if name not in physical.names}
-    for name in known:
-        if name in physical.names and name not in used:
-            uses = [
-                f"{each.parameter} needs {', '.join(each.needs)}" for each in physical.conversions if name in each.needs
-            ]
-            raise InputError(f"{name}: nothing follows from it ({'; '.join(uses)}); allowed is to leave it out")
     constant = {name: _first(value) for name, value in found.items() if not isinstance(value, Along)}
     others = {name: value for name, value in fixed.items() if name not in physical.names}
     data = {name: value for name, value in {**fixed, **everything}.items() if name in physical.names}

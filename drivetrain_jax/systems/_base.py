@@ -218,7 +218,7 @@ class System(eqx.Module):
                 guess = meant(name, known.values())
                 raise InputError(f"{name}: unknown{guess}; allowed is {', '.join(known)}")
         given = {name: _admitted(known[name], value) for name, value in data.items()}
-        found = given | cls.physical.converted(given)
+        found = given | cls.physical.all_converted(given)
         return cls(**{name: value for name, value in found.items() if name not in cls.physical.names})
 
     @classmethod
@@ -289,7 +289,7 @@ def _admitted(described: Parameter, value: Any) -> Any:
         return None
     if described.choices or described.text:
         return _checked(described, value)
-    if described.listed and not described.broadcast and isinstance(value, (np.ndarray, jax.Array)) and value.ndim == 1:
+    if described.listed and isinstance(value, (np.ndarray, jax.Array)) and value.ndim == 1:
         value = value if isinstance(value, jax.core.Tracer) else value.tolist()
     if described.listed and isinstance(value, (list, tuple)):
         each = replace(described, listed=False)

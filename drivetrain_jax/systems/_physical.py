@@ -24,7 +24,8 @@ class Conversion:
 
     It takes place if the first of ``needs``, a quantity, is given; the others must then be known. ``formula`` is its text.
     ``back(parameter, *needs[1:])`` returns that quantity. Lists among ``needs`` are taken entry by entry, except ``whole``
-    ones. An ``optional`` conversion gives way to a given parameter, and to data that are not given.
+    ones; one number is repeated for each entry of the parameter ``per``. A ``replaceable`` conversion gives way to a given
+    parameter, an ``optional`` one also to data that are not given.
     """
 
     parameter: str
@@ -33,6 +34,8 @@ class Conversion:
     formula: str
     back: Callable[..., Any] | None = None
     optional: bool = False
+    replaceable: bool = False
+    per: str = ""
     whole: tuple[str, ...] = ()
 
 
@@ -76,7 +79,7 @@ class PhysicalData:
             if each.needs[0] not in known or each.needs[0] in defaults:
                 continue
             missing = [name for name in each.needs if name not in known]
-            if each.parameter in given and each.optional:
+            if each.parameter in given and (each.optional or each.replaceable):
                 continue
             if each.parameter in given:
                 given_text = _shown(given[each.parameter])
@@ -88,13 +91,23 @@ class PhysicalData:
                     f"{missing[0]}: missing; {each.parameter} = {each.formula} needs {' and '.join(missing)}"
                 )
             if not missing:
-                found[each.parameter] = _evaluated(each, [known[name] for name in each.needs])
+                value, entries = _evaluated(each, [known[name] for name in each.needs]), known.get(each.per)
+                if isinstance(entries, tuple) and not isinstance(value, tuple):
+                    value = (value,) * len(entries)
+                found[each.parameter] = value
         return found
 
-    def used(self, given: Mapping[str, Any]) -> set[str]:
-        """The quantities of ``given`` that a conversion uses."""
+    def all_converted(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """As :meth:`converted`; raises :class:`InputError` for a quantity from which nothing follows."""
         found = self.converted(given)
-        return {name for each in self.conversions if each.parameter in found for name in each.needs}
+        used = {name for each in self.conversions if each.parameter in found for name in each.needs}
+        for name in self.names:
+            if name in given and name not in used:
+                uses = [
+                    f"{each.parameter} needs {', '.join(each.needs)}" for each in self.conversions if name in each.needs
+                ]
+                raise InputError(f"{name}: nothing follows from it ({'; '.join(uses)}); allowed is to leave it out")
+        return found
 
     def back(self, parameter: str, known: Mapping[str, Any]) -> tuple[Parameter, Callable[[Any], Any]] | None:
         """The quantity behind ``parameter``, and its value as a function of the parameter; None if there is none, or if data

@@ -211,6 +211,53 @@ def test_one_diameter_may_vary():
     assert found.critical_speed.values[1] == pytest.approx(wide.critical_speed, rel=1e-9)
 
 
+def every_door(given, modes):
+    """The critical speeds [rpm] of a shaft from a point, a run and the module; ``dt.run`` is ``drivetrain run``."""
+    scene = {"system": "bicardan", "analysis": "critical_speeds", "outputs": ["critical_speed"]}
+    return [
+        dt.point("bicardan", "critical_speeds", **given, modes=modes, outputs=["critical_speed"]).critical_speed,
+        dt.run({**scene, "fixed": given, "options": {"modes": modes}}).critical_speed.values,
+        dt.critical_speeds(dt.Bicardan.from_physical(**given), outputs="critical_speed", modes=modes).critical_speed,
+    ]
+
+
+UNIFORM = {"length": ["750 mm", "750 mm"], "outer_diameter": "90 mm", "k_A": 1e8, "k_D": 1e8}
+
+
+def test_one_diameter_stands_for_all_segments():
+    for found in every_door(UNIFORM | {"material": "steel"}, 2):
+        assert found == pytest.approx([4671.14, 16452.8], rel=1e-6)
+    lists = UNIFORM | {"material": "steel", "outer_diameter": np.array([0.09, 0.09])}
+    assert dt.Bicardan.from_physical(**lists) == dt.Bicardan.from_physical(**UNIFORM, material="steel")
+    axes = {"outer_diameter": ["80 mm", "90 mm"]}
+    fixed = {name: value for name, value in UNIFORM.items() if name != "outer_diameter"} | {"material": "steel"}
+    scene = load_scene({"system": "bicardan", "analysis": "critical_speeds", "axes": axes, "fixed": fixed})
+    assert [part.name for part in scene.axes[0].together] == [
+        f"{name}[{i}]" for name in ("EI", "rhoA", "kGA", "rhoI") for i in (0, 1)
+    ]
+
+
+@pytest.mark.parametrize("mass", [{"density": 0}, {"rhoA": [0, 0]}])
+def test_a_shaft_without_mass_has_a_diameter(mass):
+    """The mass vibrates on the spring of its support and, in series, of the bent shaft and of the ends."""
+    given = UNIFORM | {"E": 2.1e11, "k_joint": [1e6], "m_joint": [10.0]} | mass
+    bent = 48 * 2.1e11 * math.pi / 64 * 0.09**4 / 1.5**3
+    speed = math.sqrt((1 / (1 / bent + 1 / 2e8) + 1e6) / 10) * 30 / math.pi
+    for found in every_door(given, 1):
+        assert found == pytest.approx([speed], rel=1e-9)
+
+
+def test_mass_is_given_once():
+    steel = dt.Bicardan.from_physical(**UNIFORM, material="steel", rhoA=[10, 0])
+    assert steel.rhoA == (10, 0) and steel.rhoI == pytest.approx((10 * 0.09**2 / 16, 0)) and steel.kGA[0] > 0
+    twice = UNIFORM | {"E": 2.1e11, "density": 7850, "rhoA": [10, 10]}
+    with pytest.raises(dt.InputError, match=r"^density: nothing follows from it \(rhoA needs"):
+        dt.Bicardan.from_physical(**twice)
+    assert "density: nothing follows from it" in refused(
+        {"system": "bicardan", "analysis": "critical_speeds", "fixed": twice}
+    )
+
+
 def test_a_length_that_looks_like_millimetres_is_warned_of():
     with pytest.warns(UserWarning, match=r'^length\[1\] = 900 m: more than 100 m; is "900 mm" meant\?$'):
         dt.Bicardan(length=[0.3, 900], EI=[1e4, 1e4], rhoA=[15, 15], k_A=1e6, k_D=1e6)
