@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -287,3 +288,54 @@ def test_deflection_is_continuous_at_an_elastic_joint():
         "bicardan", "critical_speeds", outputs=["mode_shape"], modes=2, stations=10001, **values
     ).mode_shape
     assert np.abs(np.diff(shapes, axis=1)).max() < 2e-3
+
+
+HINGED = {"k_A": INF, "k_D": INF, "k_joint": INF, "k_hinge": 0.0}
+
+
+def shapes_of(modes: int, stations: int, **shaft: Any) -> np.ndarray:
+    outputs = ["angular_frequency", "mode_shape"]
+    found = dt.critical_speeds(dt.Bicardan(**shaft), modes=modes, stations=stations, outputs=outputs)
+    return np.asarray(found.mode_shape)
+
+
+@pytest.mark.parametrize("spans", [2, pytest.param(3, marks=pytest.mark.full), pytest.param(4, marks=pytest.mark.full)])
+@pytest.mark.parametrize("support", [{}, {"k_joint": 1e25, "k_hinge": 1e-20}], ids=["exact", "almost"])
+def test_each_mode_of_a_multiple_frequency_moves_one_span(spans, support):
+    """Sine waves in one span each: linearly independent, orthogonal in the mass."""
+    shaft = {"length": (0.5,) * spans, "EI": (2e4,) * spans, "rhoA": (5.0,) * spans, **HINGED, **support}
+    found = shapes_of(2 * spans, 30 * spans + 1, **shaft)
+    x = np.linspace(0.0, spans, 30 * spans + 1)
+    moved = [int(x[np.abs(shape).argmax()]) for shape in found]
+    assert sorted(moved[:spans]) == sorted(moved[spans:]) == list(range(spans))
+    for number, (span, shape) in enumerate(zip(moved, found, strict=True)):
+        waves = 1 + number // spans
+        expected = np.where((x >= span) & (x <= span + 1), np.sin(waves * np.pi * x), 0.0)
+        expected *= np.sign(expected @ shape) / np.abs(expected).max()
+        assert np.abs(shape - expected).max() < 1e-12, number
+
+
+def test_modes_of_a_frequency_that_parts_share_with_their_neighbours():
+    """Three spans of one frequency with shear and rotary inertia, the middle one in two segments of another make."""
+    shaft = {"length": (0.5, 0.25, 0.25, 0.5), "EI": (2e4,) * 4, "rhoA": (5.0,) * 4, "kGA": 1e7, "rhoI": 1e-3}
+    joints = {"k_joint": (INF, 0.0, INF), "k_hinge": (0.0, INF, 0.0)}
+    found = shapes_of(3, 91, **shaft, **HINGED | joints)
+    moved = [[np.abs(part).max() > 1e-10 for part in (s[:30], s[31:60], s[61:])] for s in found]
+    assert sorted(moved) == np.eye(3, dtype=bool)[::-1].tolist()
+
+
+@pytest.mark.parametrize("more", [0.0, 1e-8])
+def test_a_disc_that_moves_and_turns_at_one_frequency(more):
+    """With I = m l^2/4, 48 EI/(m l^3) = 12 EI/(I l): both modes are mixtures, orthogonal in the mass of the disc. With a
+    little more inertia the disc turns at a lower frequency than it moves."""
+    disc = {"m_joint": 10.0, "I_joint": 2.5 * (1 + more), "k_A": INF, "k_D": INF}
+    found = shapes_of(2, 2001, length=(0.5, 0.5), EI=(2e4, 2e4), rhoA=(0.0, 0.0), **disc)
+    deflection, slope = found[:, 1000], np.gradient(found[:, :1001], 1 / 2000, axis=1, edge_order=2)[:, -1]
+    mass = 10.0 * np.outer(deflection, deflection) + 2.5 * np.outer(slope, slope)
+    assert abs(mass[0, 1]) < 1e-5 * math.sqrt(mass[0, 0] * mass[1, 1])
+    x = np.linspace(0.0, 1.0, 2001)
+    half = np.minimum(x, 1 - x)
+    moves, turns = 3 * half - 4 * half**3, np.sign(0.5 - x) * (half - 4 * half**3)
+    basis = np.stack([moves, turns / np.abs(turns).max()])
+    rest = found - np.linalg.lstsq(basis.T, found.T, rcond=None)[0].T @ basis
+    assert np.abs(rest).max() < 1e-7 and (not more or np.abs(np.abs(found) - np.abs(basis[::-1])).max() < 1e-4)

@@ -6,7 +6,8 @@ for any mode. The method ``krylov_determinant`` is the paper's and loses all dig
 its roots with the right number.
 
 Modes are numbered by frequency and not followed along an axis. The frequencies of a shaft in one plane between separated
-ends are simple (except with a hinge on, or almost on, a rigid support), so curves of equal number do not cross.
+ends are simple (except with a hinge on, or almost on, a rigid support, or by coincidence), so curves of equal number do not
+cross. Shapes of a multiple frequency are orthogonal in the mass.
 
 A shaft without mass in its segments has as many frequencies as masses and inertias; further ones are infinite.
 
@@ -113,9 +114,10 @@ def _shapes(shaft: Shaft, roots: Roots, stations: int) -> Array:
     modes, lanes = roots.q.shape[0], roots.q.shape[1:]
     x = jnp.linspace(0.0, 1.0, stations)
     finite = jnp.isfinite(roots.q)
-    elastic = mode_shapes(shaft, jnp.where(finite & (roots.q > 0), roots.q, 1.0), x)
-    elastic = jnp.where(jnp.isinf(roots.q)[:, None], 0.0, elastic)
     index = jnp.arange(modes).reshape(modes, *(1,) * len(lanes))
+    # Different numbers in place of the others: equal ones would be a cluster.
+    elastic = mode_shapes(shaft, jnp.where(finite & (roots.q > 0), roots.q, 1.0 + index), x)
+    elastic = jnp.where(jnp.isinf(roots.q)[:, None], 0.0, elastic)
     mechanisms = mechanism_shapes(shaft, x)
     row = jnp.broadcast_to(jnp.minimum(index, len(mechanisms) - 1), (modes, *lanes))
     rigid = normalised(jnp.take_along_axis(mechanisms, row[:, None], axis=0))

@@ -10,25 +10,26 @@ also where the product has lost a part that hardly moves, or is at rest.
 
 from __future__ import annotations
 
-from functools import partial
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.critical_speeds.compound import hinge_shares, planes, rotation_shares, support_shares
-from drivetrain_jax.analysis.critical_speeds.segments import Scales, between, split_inertia
-from drivetrain_jax.analysis.critical_speeds.waves import Plane, Waves, even_and_odd
+from drivetrain_jax.analysis.critical_speeds.compound import planes
+from drivetrain_jax.analysis.critical_speeds.eigenspace import states_in_clusters
+from drivetrain_jax.analysis.critical_speeds.links import Links, Segments, across_joints, along_segments
+from drivetrain_jax.analysis.critical_speeds.segments import Scales
+from drivetrain_jax.analysis.critical_speeds.waves import Plane, even_and_odd
 from drivetrain_jax.analysis.numerics.linear_algebra import matmul
 from drivetrain_jax.systems import Shaft
 
 # Multiple of its asymmetry up to which the product of two planes is rounding.
 _APART = 30.0
 # A deflection up to this part of the state is rounding.
-_ROUNDING = 64 * np.finfo(float).eps
+_ROUNDING = 1024 * np.finfo(float).eps
 # The state (f, theta, M, F) seen from the other end of the shaft.
 _MIRROR = np.array([1.0, -1.0, 1.0, -1.0])
 
@@ -68,158 +69,7 @@ def _shared_states(left: Plane, right: Plane) -> tuple[Array, Array, Array]:
     return column / jnp.where(entry == 0, 1.0, entry), jnp.abs(entry), moving
 
 
-class _Segments(NamedTuple):
-    """The waves of all segments at the frequencies of the modes, ``(n, modes, ...)``.
-
-    With the rotation ``(cosine, sine)`` the state falls into two pairs with ``alpha' = beta``, ``beta' = r^2 alpha``:
-    ``alpha = sine F - cosine theta``, ``beta = sine f - cosine M`` with ``r^2 = -trigonometric2``, and ``alpha = sine
-    theta + cosine F``, ``beta = cosine f + sine M`` with ``r^2 = hyperbolic2``. ``z`` is the phase of a whole segment. A
-    segment without mass (``massless``) has no waves: its deflection is a cubic, with the ``shear`` number.
-    """
-
-    z: Array
-    cosine: Array
-    sine: Array
-    trigonometric2: Array
-    hyperbolic2: Array
-    shear: Array
-    massless: Array
-
-    @classmethod
-    def of(cls, shaft: Shaft, q: Array) -> _Segments:
-        """Of the segments of ``shaft`` at ``q = sqrt(p)``."""
-        scales = Scales.of(shaft)
-        square = (q * scales.b[:, None]) ** 2
-        none = jnp.zeros_like(square)
-        s = none if shaft.kGA is None else square * (shaft.EI / shaft.kGA)[:, None]
-        massless = shaft.rhoA == 0
-        t = none if shaft.rhoI is None else square * (shaft.rhoI / jnp.where(massless, 1.0, shaft.rhoA))[:, None]
-        half = (s - t) / 2
-        root = jnp.sqrt(half * half + 1)
-        ratio = jnp.where(half > 0, half + root, 1 / (root - half))
-        size = jnp.sqrt(1 + ratio * ratio)
-        waves = Waves.of(s, t)
-        z, pair = q * scales.beta[:, None], (waves.trigonometric2, waves.hyperbolic2)
-        return cls(z, 1 / size, ratio / size, *pair, s, massless[:, None])
-
-    def split(self, v: Array) -> tuple[Array, Array, Array, Array]:
-        """alpha and beta of the trigonometric and of the hyperbolic pair."""
-        f, theta, moment, force = v
-        c, s = self.cosine, self.sine
-        return s * force - c * theta, s * f - c * moment, s * theta + c * force, c * f + s * moment
-
-    @property
-    def number(self) -> Array:
-        """The real wave number of the hyperbolic pair, 0 above the cut-off."""
-        return jnp.sqrt(jnp.maximum(self.hyperbolic2, 0.0))
-
-    @property
-    def long(self) -> Array:
-        """True if the hyperbolic pair is treated as a falling and a rising wave."""
-        return self.number * self.z > 1
-
-    def cubic(self, xi: Array) -> tuple[Array, Array, Array, Array]:
-        """Deflection at the phase ``xi`` of a segment without mass, as a form of the state in front of it."""
-        half = 0.5 * xi * xi
-        return jnp.ones_like(half), xi, half, xi * (half / 3 - self.shear)
-
-
-class _Links(NamedTuple):
-    """Four linear forms of the state that are the same at two sections, the state being ``v`` at the first of them and
-    ``w`` at the second: ``before @ v = behind @ w``, arrays ``(n, 4, 4, modes, ...)``.
-
-    Nothing in them is large, so that their values are known to rounding of ``v``: where a part cannot be told from
-    ``v``, such as a wave that grows or the force behind a rigid support, the form vanishes at the second section.
-    """
-
-    before: Array
-    behind: Array
-
-
-def _along_segments(w: _Segments) -> _Links:
-    """From the start of every segment to its end, for either direction."""
-    o, c, s = jnp.zeros_like(w.cosine), w.cosine, w.sine
-    alpha, beta, alpha_h, beta_h = (
-        jnp.stack(form, axis=1) for form in ((o, -c, o, s), (s, o, -c, o), (o, s, o, c), (c, o, s, o))
-    )
-    w, long = _Segments(*(field[:, None] for field in w)), w.long[:, None]
-    cos, sin, _ = even_and_odd(-w.trigonometric2, w.z)
-    ch, sh, growth = even_and_odd(w.hyperbolic2, w.z)
-    unit, nu = jnp.exp(-growth), jnp.sqrt(w.trigonometric2)
-    size = jnp.sqrt(jnp.maximum(jnp.abs(w.hyperbolic2), 1.0))
-    falling, rising = beta_h - w.number * alpha_h, beta_h + w.number * alpha_h
-    before = (
-        cos * alpha + sin * beta,
-        (cos * beta - w.trigonometric2 * sin * alpha) / nu,
-        jnp.where(long, unit * falling, ch * alpha_h + sh * beta_h),
-        jnp.where(long, rising, (ch * beta_h + w.hyperbolic2 * sh * alpha_h) / size),
-    )
-    behind = (
-        alpha,
-        beta / nu,
-        jnp.where(long, falling, unit * alpha_h),
-        unit * jnp.where(long, rising, beta_h / size),
-    )
-    waves = _Links(jnp.stack(before, axis=1), jnp.stack(behind, axis=1))
-    return jax.tree.map(partial(jnp.where, w.massless[:, None]), _without_mass(w), waves)
-
-
-def _without_mass(w: _Segments) -> _Links:
-    """The four components of the state behind a segment without mass, each over the sum of its coefficients."""
-    one, o = jnp.ones_like(w.z), jnp.zeros_like(w.z)
-    deflection = w.cubic(w.z)
-    rows = (deflection, (o, one, w.z, deflection[2]), (o, o, one, w.z), (o, o, o, one))
-    size = jnp.stack([sum(jnp.abs(x) for x in row) for row in rows], axis=1)
-    before = jnp.stack([jnp.concatenate(row, axis=1) for row in rows], axis=1)
-    own = jnp.eye(4).reshape(1, 4, 4, *(1,) * (w.z.ndim - 2))
-    return _Links(before / size, own / size)
-
-
-def _across_joints(shaft: Shaft, q: Array) -> _Links:
-    """Across the joint, its inertias and the support in front of every segment; in front of the first one anything.
-
-    ``f`` passes. ``theta + M/k_hinge`` and ``F - k f`` become theta and F. The moment within the joint is ``M + kappa
-    theta`` in front and ``M - kappa theta`` behind it (kappa: that of the rotary inertia there). Each is multiplied by what
-    keeps it finite.
-    """
-    scales = Scales.of(shaft)
-
-    def last(x: Array) -> Array:
-        return jnp.concatenate([x[:1], x[:-1]])
-
-    def joints(x: Array) -> Array:
-        return jnp.concatenate([x[:1], x])[:, None]
-
-    b, e1, e2, e3 = (joints(between(x)) if shaft.segments > 1 else x[:, None] for x in scales[1:5])
-    masses = None if shaft.m is None else shaft.m[:-1, None]
-    keep, reaction = support_shares(shaft.k[:-1, None], masses, e3, q)
-    hold, turn = (
-        (1.0, 0.0) if shaft.k_hinge is None or shaft.segments == 1 else hinge_shares(joints(shaft.k_hinge), e1, q)
-    )
-    inertias = (None if x is None else x[: shaft.segments, None] for x in split_inertia(shaft))
-    (pass_1, kappa_1), (pass_2, kappa_2) = (
-        (1.0, 0.0) if x is None else rotation_shares(None, x, e1, q) for x in inertias
-    )
-
-    def forms(units: tuple[Array, ...], turn: Any, hold: Any, kappa: Any, reaction: Any) -> Array:
-        theta, moment, force = (unit[:, None] for unit in units)
-        rows = (
-            (1.0, 0.0, 0.0, 0.0),
-            (0.0, hold * (theta / b), turn * e2 / b * (moment / e2), 0.0),
-            (0.0, kappa * theta / e2, pass_1 * pass_2 * (moment / e2), 0.0),
-            (-reaction / e3, 0.0, 0.0, keep * (force / e3)),
-        )
-        entries = jnp.broadcast_arrays(*(jnp.asarray(x, float) for row in rows for x in row), keep)
-        return jnp.stack(entries[:-1], axis=1).reshape(len(keep), 4, 4, *keep.shape[1:])
-
-    units = scales.b, scales.e2, scales.e3
-    before = forms(
-        tuple(last(x) for x in units), turn * pass_1, hold * pass_1 + turn * kappa_1, pass_2 * kappa_1, reaction
-    )
-    return _Links(before, forms(units, 0.0, hold * pass_1, -pass_1 * kappa_2, 0.0))
-
-
-def _next_state(plane: Array, link: _Links, state: Array) -> Array:
+def _next_state(plane: Array, link: Links, state: Array) -> Array:
     """The state in a plane behind a link, ``(4, ...)``: from the two forms that differ most there, 0 if all are 0."""
     rows, values = link.behind, matmul(link.before, state[:, None])[:, 0]
     images = matmul(plane, jnp.swapaxes(rows, 0, 1))
@@ -233,9 +83,7 @@ def _next_state(plane: Array, link: _Links, state: Array) -> Array:
     return jnp.where(minor == 0, 0.0, result / jnp.where(minor == 0, 1.0, minor))
 
 
-def _carried(
-    across: _Links, along: _Links, ahead: tuple[Plane, Plane], start: Array | np.ndarray, place: Array
-) -> Array:
+def _carried(across: Links, along: Links, ahead: tuple[Plane, Plane], start: Array | np.ndarray, place: Array) -> Array:
     """States at the 2n ends of segments from the one at ``place`` (``start``) to the last; 0 before. ``ahead`` are the
     planes of the other side there, in front of and behind the segments. Shape ``(2n, 4, modes, ...)``."""
 
@@ -250,7 +98,7 @@ def _carried(
     return states.reshape(2 * segments, *start.shape)
 
 
-def _end_states(shaft: Shaft, q: Array, waves: _Segments) -> tuple[Array, Array]:
+def _end_states(shaft: Shaft, q: Array, waves: Segments) -> tuple[Array, Array]:
     """States in front of and behind every segment in its own coordinates, of one scale: ``(n, 4, modes, ...)``."""
     mirrored = shaft.mirrored()
     front, behind, log_front, log_behind = planes(shaft, q)
@@ -262,24 +110,24 @@ def _end_states(shaft: Shaft, q: Array, waves: _Segments) -> tuple[Array, Array]
 
     at_front, at_behind = _shared_states(front, right_front), _shared_states(behind, right_behind)
     shared, square, moving = (ends(a, b) for a, b in zip(at_front, at_behind, strict=True))
-    # If independent parts share a frequency, all is rounding and any amplitudes are valid.
+    # If parts share a frequency, all is rounding; their states come from the eigenspace.
     moving = moving | ~jnp.any(moving, axis=0)
     logs = ends(log_front + log_d_behind[::-1], log_behind + log_d[::-1])
     unit = jnp.log(jnp.repeat(Scales.of(shaft).e1, 2, axis=0))[:, None]
     place = jnp.argmax(jnp.where(moving, jnp.log(square) + unit + logs, -jnp.inf), axis=0)
     start = jnp.take_along_axis(shared, place[None, None], axis=1)[:, 0]
 
-    along, turned = _along_segments(waves), _MIRROR.reshape(4, *(1,) * q.ndim)
-    to_the_right = _carried(_across_joints(shaft, q), along, (right_front, right_behind), start, place)
+    along, turned = along_segments(waves), _MIRROR.reshape(4, *(1,) * q.ndim)
+    to_the_right = _carried(across_joints(shaft, q), along, (right_front, right_behind), start, place)
     last = 2 * shaft.segments - 1
     along, ahead = jax.tree.map(lambda x: x[::-1], (along, (behind, front)))
-    to_the_left = _carried(_across_joints(mirrored, q), along, ahead, turned * start, last - place)[::-1] * turned
+    to_the_left = _carried(across_joints(mirrored, q), along, ahead, turned * start, last - place)[::-1] * turned
     number = jnp.arange(last + 1).reshape(-1, *(1,) * (q.ndim + 1))
-    states = jnp.where(number < place, to_the_left, to_the_right)
+    states = states_in_clusters(shaft, q, jnp.where(number < place, to_the_left, to_the_right))
     return states[::2], states[1::2]
 
 
-def _deflection(w: _Segments, front: Array, behind: Array, xi: Array) -> Array:
+def _deflection(w: Segments, front: Array, behind: Array, xi: Array) -> Array:
     """Deflection at the phases ``xi`` in [0, z] of a segment with these states at its ends."""
     alpha, beta, alpha_h, beta_h = w.split(front)
     _, _, alpha_end, beta_end = w.split(behind)
@@ -300,14 +148,14 @@ def mode_shapes(shaft: Shaft, q: Array, x: Array) -> Array:
     ``q`` has shape ``(modes, *lanes)``, the result ``(modes, len(x), *lanes)``. The largest deflection is +1. A mode that
     turns without deflection, as hinged spans with shear and rotary inertia have at their cut-off, is 0 everywhere.
     """
-    waves, b = _Segments.of(shaft, q), Scales.of(shaft).b
+    waves, b = Segments.of(shaft, q), Scales.of(shaft).b
     front, behind = _end_states(shaft, q, waves)
     lanes = q.shape[1:]
     place = x.reshape(len(x), *(1,) * len(lanes)) * jnp.sum(shaft.length, axis=0)
     starts = jnp.cumsum(shaft.length, axis=0) - shaft.length
     shape = jnp.zeros((q.shape[0], len(x), *lanes))
     for i in range(shaft.segments):
-        wide = _Segments(*(field[i][:, None] for field in waves))
+        wide = Segments(*(field[i][:, None] for field in waves))
         xi = (q * b[i])[:, None] * jnp.clip(place - starts[i], 0.0, shaft.length[i])
         here = _deflection(wide, front[i][:, :, None], behind[i][:, :, None], xi)
         shape = here if i == 0 else jnp.where(place >= starts[i], here, shape)
