@@ -68,6 +68,8 @@ Numbers = tuple[Number, ...]
 class Bicardan(System):
     """The stepped shaft of the module's docstring: segments from A to D, joints between them.
 
+    It has no ``vector_field``: the shaft is a continuum, whose modes are exact and not those of an ODE.
+
     >>> from drivetrain_jax import Bicardan
     >>> Bicardan(**Bicardan.presets["paper"]).shaft().segments
     3

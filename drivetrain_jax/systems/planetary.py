@@ -16,6 +16,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
+import jax.numpy as jnp
+from jax import Array
+
 from drivetrain_jax._wording import counted
 from drivetrain_jax.systems._base import Number, System, parameter, serves
 from drivetrain_jax.systems._modal import DrivenSprings, SpringSystem
@@ -78,9 +81,12 @@ _OF_SPRINGS = (
 class Planetary(System):
     """The gear of the module's docstring; a parameter of planets is one number for all, or a list with one per planet.
 
+    >>> import jax.numpy as jnp
     >>> from drivetrain_jax import Planetary
     >>> Planetary().springs().mass.shape
     (21,)
+    >>> print(Planetary().vector_field(0.0, jnp.zeros(42)).shape)
+    (42,)
     """
 
     name = "planetary"
@@ -147,3 +153,14 @@ class Planetary(System):
     def driven(self) -> DrivenSprings:
         """The gear under harmonic transmission errors of its meshes and torques on its bodies."""
         return driven_springs(self.values, self.springs())
+
+    def vector_field(self, t: Any, y: Array) -> Array:
+        """``(q', q'')`` of ``y = (q, q')``, shape ``(2 dofs, ...)``: the free motion (1), the same at all times ``t``.
+
+        Errors and torques are left out: their frequency belongs to ``harmonic_response`` and not to the gear.
+        """
+        del t
+        springs, (q, rate) = self.springs(), jnp.split(jnp.asarray(y), 2)
+        pulls = springs.stiffness * jnp.sum(springs.extensions * q, axis=1)
+        forces = jnp.sum(springs.extensions * pulls[:, None], axis=0)
+        return jnp.concatenate([rate, -forces / springs.mass])
