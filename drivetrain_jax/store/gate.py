@@ -36,6 +36,8 @@ _FILTERS = frozenset({1, 2, 3, 4, 5, 6})
 _passed: dict[tuple[int, ...], None] = {}
 _written: set[tuple[int, ...]] = set()
 _REMEMBERED = 4096
+# What HDF5 says of a file that another program has open for writing.
+_LOCKED = "unable to lock file"
 _SCAN = "import sys; sys.path[:] = sys.argv[2:]; from drivetrain_jax.store import gate; gate.main(sys.argv[1])"
 
 
@@ -46,6 +48,8 @@ def opened(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
             yield file
+    except BlockingIOError as error:
+        raise unreadable(path, _LOCKED) from error
     except BROKEN as error:
         raise unreadable(path, "") from error
 
@@ -90,6 +94,8 @@ def unreadable(path: Path, reason: str) -> InputError:
         return InputError(f"file = {str(path)!r}: a folder of unfinished work; give {str(path.with_suffix(''))!r}")
     if (path / "zarr.json").is_file():
         return InputError(f"file = {str(path)!r}: a Zarr store; give the file that `drivetrain export` makes of it")
+    if _LOCKED in reason:
+        return InputError(f"file = {str(path)!r}: locked by another program; wait until that program closes it")
     what = "is a folder" if path.is_dir() else "not a readable netCDF4/HDF5 file"
     more = f", or damaged in its structure ({reason})" if reason else ""
     return InputError(f"file = {str(path)!r}: {what}{more}; give a result written by `drivetrain run`")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import h5py
@@ -249,3 +251,21 @@ def test_a_damaged_plan_is_one_line(path, capsys, scene):
     (parts / "plan.json").write_text(f'{{"scene": {scene}, "digest": 3, "reused_files": 4}}')
     for words in (["plot", "n.nc", "--out", "f.png"], ["run", "scene.toml", "--out", "n.nc"]):
         assert main(words) == 2 and len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("known", [False, True], ids=["first reading", "known structure"])
+def test_a_file_that_another_program_writes_is_locked(path, capsys, known):
+    """Also if this process has read the structure of the file before."""
+    if not known:
+        gate._passed.clear()
+    code = f"import h5py; file = h5py.File({str(path)!r}, 'r+'); print('open', flush=True); input()"
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline().strip() == b"open"
+        if known:
+            gate._remember(gate._state(os.stat(path)))
+        assert main(["verify", str(path)]) == 2
+        with pytest.raises(InputError, match="locked by another program"):
+            dt.open_result(path)
+        other.communicate(b"\n")
+    said = capsys.readouterr().err
+    assert said == f"drivetrain: file = {str(path)!r}: locked by another program; wait until that program closes it\n"
