@@ -258,6 +258,7 @@ def test_wrong_input_is_one_line(call, message):
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.full
 def test_an_empty_batch_has_empty_derivatives():
     slopes = jax.vmap(jax.grad(lambda s: dt.floquet(s).spectral_radius))(jax.tree.map(lambda _: jnp.zeros(0), SHAFT))
     assert slopes.beta.shape == (0,)

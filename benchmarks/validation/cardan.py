@@ -172,7 +172,7 @@ def _destabilising_rows() -> list[list[str]]:
     for i, zeta in enumerate(zetas):
         rho, verdict = float(ds.spectral_radius[i]), names[int(ds.verdict[i])]
         independent = spectral_radius(monodromy(BASE_CASE | {"beta": 1.14, "Omega": 0.6695, "zeta": zeta}))
-        why = "marginal without damping" if zeta == 0 else "damping destabilises here, against the paper's conclusion"
+        why = "bounded without damping" if zeta == 0 else "damping destabilises here, against the paper's conclusion"
         rows.append(
             [
                 f"rho at (1.14, 0.6695), zeta = {zeta:g}",

@@ -77,4 +77,4 @@ def results_of_propagator(
     halves = form.halves
     rounding = 4 * np.finfo(float).eps * jnp.sum(matrix**2, axis=(0, 1)) ** (halves / 2) / rho
     monodromy = Monodromy(z, jnp.zeros_like(rho), relative + rounding, relative <= 10 * rtol, residual)
-    return results(monodromy, outputs, rtol, model.natural, spectrum=spectrum)
+    return results(monodromy, outputs, rtol, model, spectrum=spectrum)

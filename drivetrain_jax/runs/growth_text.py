@@ -31,9 +31,9 @@ def growth_of(
     """The growth at a ``point`` (parameters); ``turns`` is the speed [rpm], if known, of a shaft whose time has no unit."""
     radius = results.get("spectral_radius")
     frequency = point.get(system.roles.get("speed", "")) if system.time_units == "s" else None
-    # An undecided radius is 1 within its error, and so is its growth 0.
+    # An undecided radius is 1 within its error, and so is its growth 0; without damping it is 1.
     undecided = int(results.get("verdict", 0)) == VERDICTS.index("undecided")
-    if radius is None or undecided or not (frequency or system.periods_per_turn):
+    if radius is None or undecided or abs(radius - 1) < 1e-15 or not (frequency or system.periods_per_turn):
         return {}
     # A period takes 1/frequency seconds; otherwise the unit of time is the turn.
     turn = 60 / turns if turns else 1.0

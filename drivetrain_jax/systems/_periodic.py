@@ -18,6 +18,8 @@ from drivetrain_jax.systems._rows import Rows, dense
 
 # Distance from a breakpoint at which its two sides are evaluated, over the span: more than the rounding of a time.
 _ASIDE = 1e-15
+# Fractions of the span, spread by the golden ratio, at which a matrix is tested for damping.
+_INSTANTS = np.arange(1, 17) * 0.6180339887498949 % 1
 
 
 def _vanishes(entry: Any) -> bool:
@@ -165,7 +167,8 @@ class FloquetModel(eqx.Module):
     multipliers) that is cheaper or better conditioned; both may be the same object. ``explicit_steps(rtol)`` predicts the
     number of steps of ``reduced`` by the explicit scheme of order 8, from parameters as NumPy arrays of shape ``(N,)`` or
     traced arrays; None leaves the prediction to the analysis. ``hamiltonian()`` is true where ``reduced`` is a Hamiltonian
-    system, whose multipliers come in pairs sigma, 1/sigma; None means nowhere. ``stiff`` is a form for strong damping, whose
+    system (without damping), whose multipliers come in pairs sigma, 1/sigma; None: where the states of ``natural`` are
+    coordinates and momenta, as for x'' = -K(t) x with a symmetric K. ``stiff`` is a form for strong damping, whose
     slow modes are not differences of large entries; None if ``reduced`` is as good. The implicit scheme always uses
     ``stiff``, the explicit scheme where ``strongly_damped()`` is true; None means nowhere.
     """
@@ -176,6 +179,19 @@ class FloquetModel(eqx.Module):
     hamiltonian: Callable[[], Any] | None = None
     stiff: LinearPeriodic | None = None
     strongly_damped: Callable[[], Any] | None = None
+
+    def is_hamiltonian(self) -> Any:
+        """True without damping: as declared, else where ``J A`` of ``natural`` is symmetric at all of some instants."""
+        if self.hamiltonian is not None:
+            return self.hamiltonian()
+        if self.natural.size % 2:
+            return False
+        half, found = self.natural.size // 2, jnp.bool_(True)
+        for part in self.natural.parts:
+            matrices = jax.vmap(part.matrix)(_INSTANTS * part.span)
+            rotated = jnp.concatenate([matrices[:, half:], -matrices[:, :half]], axis=1)
+            found &= jnp.all(rotated == jnp.swapaxes(rotated, 1, 2), axis=(0, 1, 2))
+        return found
 
 
 class ForcedModel(eqx.Module):

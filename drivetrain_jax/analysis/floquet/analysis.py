@@ -36,7 +36,7 @@ def _direct_solvers(system: type[System], request: Request) -> tuple[Solver, ...
         rtol,
         rtol / 4,
         lambda model: model.reduced,
-        lambda model, z: results(z, request.outputs, rtol, model.natural),
+        lambda model, z: results(z, request.outputs, rtol, model),
         stiff=lambda model: model.stiff or model.reduced,
     )
 
@@ -130,7 +130,6 @@ ANALYSIS = Analysis(
     solvers=_solvers,
     dimensions=lambda *_: (Dimension("multiplier", "number of the multiplier, by falling modulus", ()),),
     lacks=_lacks,
-    undecided="the spectral radius is 1 within its error: a smaller rtol than {rtol:g} may decide; without damping only "
-    "damping does",
+    undecided="the spectral radius is 1 within its error: a smaller rtol than {rtol:g} may decide",
     derivatives=_derivatives,
 )

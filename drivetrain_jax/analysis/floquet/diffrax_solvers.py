@@ -60,7 +60,7 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
         stiffness, least = stiffness_of(model.reduced, shape), stable_steps(model.reduced)
         target = rtol / _MARGIN
         z = direct_monodromy(model.reduced, propagate, steps, shape, stiffness, target, order, 2, least, most=MAX_STEPS)
-        return results(z, request.outputs, rtol, model.natural)
+        return results(z, request.outputs, rtol, model)
 
     def effort(columns: Mapping[str, Any]) -> np.ndarray:
         # Fitted for order 8; a lower order needs more steps for a smaller tolerance.
@@ -94,7 +94,7 @@ def adaptive_steps(system: type[System], request: Request) -> tuple[Solver, ...]
         fine, success = propagate(rtol / 10)
         coarse, success_coarse = propagate(rtol) if needs_error else (fine, success)
         z = compare(form, coarse, fine, jnp.zeros(()), 0.0, rtol, _REDUCTION)
-        found = results(z, request.outputs, rtol, model.natural)
+        found = results(z, request.outputs, rtol, model)
         failed = ~(success & success_coarse)
         lost = jnp.where(has_finite_entries(form), jnp.int8(Outcome.STEP_LIMIT), jnp.int8(Outcome.NOT_FINITE))
         return found | {"outcome": jnp.where(failed, lost, found["outcome"])}

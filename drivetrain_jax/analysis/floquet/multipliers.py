@@ -12,6 +12,9 @@ bracket the spectral radius rho of the true matrix:
   lies inside.
 
 Near a double multiplier (the edge of every tongue) the bound is of the size of the square root of the coefficients' error.
+
+Without damping a multiplier s has the partner 1/conj(s). If the circle about s holds no other multiplier, and its
+reflection at the unit circle meets no other circle, s is its own partner: it lies on the unit circle and is simple.
 """
 
 from __future__ import annotations
@@ -114,19 +117,47 @@ def _circle_around_all(modulus: Array, x: Array, y: Array, eps: Callable[[Array]
 
 def _circle_around_largest(modulus: Array, x: Array, y: Array, eps: Callable[[Array], Array]) -> Array:
     """Smallest r of the ladder such that a zero lies within r of the largest multiplier."""
-    n, ladder = len(x), jnp.asarray(_LADDER)
+    n = len(x)
     x1, y1, top = x[0], y[0], modulus[0]
     for j in range(1, n):
         larger = modulus[j] > top
         x1, y1, top = (jnp.where(larger, new, old) for new, old in ((x[j], x1), (y[j], y1), (modulus[j], top)))
-    # The dominant multiplier has the distance 0 from itself, so the product over all j has the factor r.
-    distances = jnp.hypot(x - x1, y - y1)
+    return _circle_around(jnp.hypot(x - x1, y - y1), eps)
+
+
+def _circle_around(distances: Array, eps: Callable[[Array], Array]) -> Array:
+    """Smallest r of the ladder such that the circle of this radius about a multiplier holds as many zeros as multipliers.
+
+    ``distances`` ``(n, ...)`` of all multipliers from it contain the 0 of its own, so the product over all of them has the
+    factor r.
+    """
+    n, ladder = len(distances), jnp.asarray(_LADDER)
 
     def descend(k: int, inner: Array) -> Array:
         r = ladder[ladder.size - 1 - k]
         return jnp.where(math.prod(jnp.abs(distances[j] - r) for j in range(n)) > eps(r), r, inner)
 
-    return jax.lax.fori_loop(0, ladder.size, descend, jnp.full(modulus.shape[1:], jnp.inf))
+    return jax.lax.fori_loop(0, ladder.size, descend, jnp.full(distances.shape[1:], jnp.inf))
+
+
+def all_on_the_circle(real: Array, imaginary: Array, error: Array, scale: Array) -> Array:
+    """True if all multipliers ``scale (real + i imaginary)`` without damping are simple and on the unit circle, ``(...)``.
+
+    ``error`` as in :func:`spectral_radius_bound`.
+    """
+    n = len(real)
+    modulus = jnp.hypot(real, imaginary)
+    rho = jnp.max(modulus, axis=0)
+    gaps = jnp.hypot(real[:, None] - real, imaginary[:, None] - imaginary) / rho
+
+    def eps(r: Array) -> Array:
+        return n * error * (1 + r) ** (n - 1)
+
+    radius = _circle_around(gaps, eps)
+    gaps = jnp.where(jnp.eye(n, dtype=bool).reshape(n, n, *(1,) * rho.ndim), jnp.inf, gaps)
+    # Four radii about a multiplier at the unit circle contain the reflection of its circle if that is below 0.1.
+    apart = (radius < 0.1) & jnp.all(gaps > 4 * radius[:, None] + radius, axis=1)
+    return jnp.all(apart & (jnp.abs(scale * modulus - 1) <= radius * scale * rho), axis=0)
 
 
 def verdict(rho: Array, error: Array) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -12,7 +13,7 @@ from jax import Array
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis._base import Outcome, finite_results
 from drivetrain_jax.analysis.floquet.direct import Monodromy
-from drivetrain_jax.analysis.floquet.multipliers import VERDICTS, sort_multipliers, verdict
+from drivetrain_jax.analysis.floquet.multipliers import VERDICTS, all_on_the_circle, sort_multipliers, verdict
 from drivetrain_jax.analysis.floquet.radius import (
     Spectrum,
     has_closed_form,
@@ -23,7 +24,7 @@ from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
 from drivetrain_jax.systems import System
 
 if TYPE_CHECKING:
-    from drivetrain_jax.systems import LinearPeriodic
+    from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
 VARIABLES = (
     Variable("floquet_multiplier", "1", "Floquet multiplier over one period", ("multiplier",), "complex128"),
@@ -35,6 +36,8 @@ VARIABLES = (
 )
 NEED_ERROR = {"spectral_radius_error", "verdict"}
 _TINY = np.finfo(float).tiny
+# Relative error of a spectral radius that is known to be 1.
+_ROUNDING = 4 * np.finfo(float).eps
 MULTIPLIERS = {"floquet_multiplier", "floquet_exponent"}
 
 
@@ -70,11 +73,12 @@ def results(
     z: Monodromy,
     outputs: tuple[str, ...],
     rtol: float,
-    system: LinearPeriodic,
+    model: FloquetModel,
     spectrum: Spectrum | None = None,
 ) -> dict[str, Array]:
-    """The requested variables and the outcome from a monodromy matrix of ``system`` with trailing batch axes.
+    """The requested variables and the outcome from a monodromy matrix of ``model`` with trailing batch axes.
 
+    Without damping stable means bounded, and the spectral radius of a stable point is 1.
     ``spectrum``: real and imaginary parts of the eigenvalues of ``z.matrix``, if known. Otherwise the spectral radius of
     four states comes from the closed form, and from eigenvalues only where the closed form is not accurate enough.
     """
@@ -85,23 +89,34 @@ def results(
     def eigen() -> Spectrum:
         return spectrum or eigenvalues(jnp.where(finite, z.matrix, jnp.nan))
 
-    found: dict[str, Array] = {}
     if wanted & MULTIPLIERS:
         spectrum = eigen()
-        found = _of_multipliers(z, finite, spectrum, system)
     if spectrum is None and has_closed_form(z.matrix):
         rho, error = radius_in_closed_form(z.matrix, z.error, size, 10 * rtol)
     else:
         rho, error = radius_by_eigenvalues(eigen(), z.error)
     # Compiled, the largest of moduli that are all NaN may be -inf.
     rho, error = (jnp.where(finite, x, jnp.nan) for x in (rho, error))
+    undamped, nowhere = finite & model.is_hamiltonian(), jnp.zeros_like(finite)
+    bounded = jax.lax.cond(
+        jnp.any(undamped), lambda: undamped & all_on_the_circle(*eigen(), z.error, size), lambda: nowhere
+    )
+    rho, error = jnp.where(bounded, 1 / size, rho), jnp.where(bounded, _ROUNDING / size, error)
+    found: dict[str, Array] = {}
+    if spectrum and wanted & MULTIPLIERS:
+        # On the circle without the error of the moduli.
+        length = jnp.where(bounded, size * jnp.hypot(*spectrum), 1.0)
+        found = _of_multipliers(z, finite, (spectrum[0] / length, spectrum[1] / length), model.natural)
     found |= {"spectral_radius": rho * size, "liouville_residual": jnp.where(finite, z.residual, jnp.nan)}
     met = z.met
     if wanted & NEED_ERROR:
         # A value that underflows is not 0, so its error bound is the smallest number.
         met = (error <= 10 * rtol * rho) & (rho * size >= _TINY)
         bound = jnp.maximum(error * size, _TINY)
-        found |= {"spectral_radius_error": bound, "verdict": verdict(rho * size, bound)}
+        found |= {
+            "spectral_radius_error": bound,
+            "verdict": jnp.where(bounded, 0, verdict(rho * size, bound)).astype(jnp.int8),
+        }
     outcome = jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
     outcome = jnp.where(finite, outcome, Outcome.NOT_FINITE)
     found = {name: found[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}

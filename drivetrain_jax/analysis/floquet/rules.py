@@ -8,6 +8,9 @@ import xarray as xr
 
 from drivetrain_jax._rules import Declared, ordered, relation, within
 
+# Error of a radius that is known to be 1: four roundings.
+_ROUNDING = 1e-15
+
 
 def _all_multipliers(compare: Callable[[xr.DataArray, xr.Dataset], xr.DataArray]) -> Callable:
     return lambda ds: compare(abs(ds["floquet_multiplier"]).max("multiplier"), ds)
@@ -17,13 +20,24 @@ def _liouville(ds: xr.Dataset) -> xr.DataArray:
     """True where the residual contradicts the bound: a coefficient's error e moves the largest of n roots by e/2^n."""
     # If the multipliers are not stored, n is four as for cardan. A larger n misses errors, a smaller n reports false ones.
     n = ds.sizes.get("multiplier", 4)
-    return abs(ds["liouville_residual"]) > 2**n * ds["spectral_radius_error"] / ds["spectral_radius"]
+    wrong = abs(ds["liouville_residual"]) > 2**n * ds["spectral_radius_error"] / ds["spectral_radius"]
+    return wrong & ~_is_one(ds)
+
+
+def _is_one(ds: xr.Dataset) -> xr.DataArray:
+    """True where the radius is known to be 1: without damping, if all multipliers are simple and on the unit circle."""
+    rho, error = ds["spectral_radius"], ds["spectral_radius_error"]
+    return (error <= _ROUNDING) & (abs(rho - 1) <= error)
 
 
 def _verdict(ds: xr.Dataset) -> xr.DataArray:
-    """0 stable, 1 unstable, 2 undecided, from the interval of the spectral radius."""
+    """0 stable, 1 unstable, 2 undecided, from the interval of the spectral radius.
+
+    Where the radius is 1, stable means bounded. Without damping an atlas also knows it to exceed 1 within its interval.
+    """
     rho, error, verdict = ds["spectral_radius"], ds["spectral_radius_error"], ds["verdict"]
-    return ((rho + error < 1) != (verdict == 0)) | ((rho - error > 1) != (verdict == 1))
+    stable, unstable = (rho + error < 1) | _is_one(ds), rho - error > 1
+    return (stable != (verdict == 0)) | (unstable & (verdict != 1)) | ((rho + error <= 1) & (verdict == 1))
 
 
 RULES = Declared(
