@@ -10,8 +10,8 @@ from drivetrain_jax.analysis.lyapunov.verdict import Evidence, Verdict, judge
 
 CHAOTIC = Evidence(
     spectrum=jnp.array([1.0, -3.0]), error=jnp.array([0.1, 0.1]), coarse=jnp.array(1.0), coarse_error=jnp.array(0.1),
-    sum_residual=jnp.array(1e-6), k01=jnp.array(0.99), bounded=jnp.array(True), growing=jnp.array(False),
-    multiple=jnp.array(0), settled=jnp.array(True), returns=jnp.array(False),
+    sum_residual=jnp.array(1e-6), k01=jnp.array(0.99), bounded=jnp.array(True), following=jnp.array(False),
+    multiple=jnp.array(0), aperiodic=jnp.array(False), returns=jnp.array(False),
     resolved=jnp.array(True), roomy=jnp.array(True),
 )  # fmt: skip
 REGULAR = CHAOTIC._replace(spectrum=jnp.array([-1.0, -3.0]), k01=jnp.array(0.0))
@@ -43,7 +43,7 @@ def test_chaos_needs_every_piece_of_evidence(missing):
     assert verdict(CHAOTIC, **missing) == Verdict.UNDECIDED
 
 
-@pytest.mark.parametrize("changed", [{"growing": True}, {"bounded": False}])
+@pytest.mark.parametrize("changed", [{"following": True}, {"bounded": False}])
 def test_growth_is_not_chaos(changed):
     assert verdict(CHAOTIC, **changed) == Verdict.PARAMETRICALLY_UNSTABLE
 
@@ -54,7 +54,7 @@ def test_growth_is_not_chaos(changed):
         {"bounded": False, "resolved": False},
         {"bounded": False, "spectrum": [float("nan")] * 2},
         {"bounded": False, "spectrum": [-1.0, -3.0]},
-        {"growing": True, "resolved": False},
+        {"following": True, "resolved": False},
         {"spectrum": [-1.0, -3.0], "k01": 0.0, "multiple": 1, "resolved": False},
         {"spectrum": [-1.0, float("nan")], "k01": 0.0, "multiple": 1},
     ],
@@ -90,9 +90,9 @@ def test_a_motion_that_left_agrees_to_a_tenth():
     [
         ({"multiple": 1}, Verdict.FIXED_POINT),
         ({"multiple": 10}, Verdict.PERIODIC),
-        ({"multiple": 0}, Verdict.QUASI_PERIODIC),
-        ({"settled": False}, Verdict.UNDECIDED),
-        ({"error": [0.4, 0.4]}, Verdict.UNDECIDED),
+        ({"aperiodic": True}, Verdict.QUASI_PERIODIC),
+        ({}, Verdict.UNDECIDED),
+        ({"multiple": 1, "error": [0.4, 0.4]}, Verdict.UNDECIDED),
     ],
 )
 def test_kinds_of_attracting_motion(changed, kind):
@@ -113,8 +113,8 @@ def test_kinds_of_attracting_motion(changed, kind):
     ],
 )
 def test_a_forced_torus_has_one_zero_exponent_and_returns(changed, kind):
-    """The exponents of the section, with errors of 0.1, and ``settled`` false as for every exponent near 0."""
-    torus = {"spectrum": [0.01, -3.0], "k01": 0.0, "settled": False, "returns": True}
+    """The exponents of the section, with errors of 0.1."""
+    torus = {"spectrum": [0.01, -3.0], "k01": 0.0, "returns": True}
     assert verdict(REGULAR, **torus | changed) == kind
 
 

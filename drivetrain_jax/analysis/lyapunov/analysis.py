@@ -1,7 +1,8 @@
 """Lyapunov spectra by the variational equations, with error estimates and a verdict.
 
-Exponents are natural logarithms per second, in falling order. Phases of the flow are left out, because their exponents are
-always zero. The paper's estimator is available under its own name.
+The exponents of an equilibrium or a periodic motion are those of its orbit (:mod:`~drivetrain_jax.analysis.lyapunov.orbit`),
+the others are averages. They are natural logarithms per second, in falling order. Phases of the flow are left out, because
+their exponents are always zero. The paper's estimator is available under its own name.
 
 The number of steps is predicted for every point (see :mod:`~drivetrain_jax.analysis.lyapunov.march_steps`) unless
 ``steps`` is given; members of a batch with similar numbers use the largest of them (see
@@ -28,7 +29,7 @@ from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import MOST_SECONDS, Analysis, Outcome, Request, Solver, in_time_of
-from drivetrain_jax.analysis.lyapunov.forcing import may_be_chaotic
+from drivetrain_jax.analysis.lyapunov.forcing import may_be_chaotic, may_rest
 from drivetrain_jax.analysis.lyapunov.growth_record import (
     SEGMENTS,
     SETTLED,
@@ -40,21 +41,29 @@ from drivetrain_jax.analysis.lyapunov.growth_record import (
     weighted_mean,
 )
 from drivetrain_jax.analysis.lyapunov.march_steps import LEAST, contraction, needed_steps
+from drivetrain_jax.analysis.lyapunov.orbit import common_period
 from drivetrain_jax.analysis.lyapunov.paper_estimator import paper_estimator
 from drivetrain_jax.analysis.lyapunov.resolution import STANDARD_ERRORS, resolved, zero_floor
-from drivetrain_jax.analysis.lyapunov.sampling import SAMPLES, Sampling, sample
+from drivetrain_jax.analysis.lyapunov.sampling import SAMPLES, sample
 from drivetrain_jax.analysis.lyapunov.step_groups import by_groups, is_short_enough, starts
-from drivetrain_jax.analysis.lyapunov.verdict import Evidence, Verdict, grows, judge
+from drivetrain_jax.analysis.lyapunov.verdict import Evidence, Verdict, follows, judge
 from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.systems import Flow, System
 
 VARIABLES = (
     Variable("lyapunov_spectrum", "1/s", "Lyapunov exponent", ("exponent",)),
-    Variable("lyapunov_standard_error", "1/s", "standard error of the exponent, from block means", ("exponent",)),
+    Variable(
+        "lyapunov_standard_error",
+        "1/s",
+        "standard error of the exponent: by twice the steps on an orbit, from block means otherwise",
+        ("exponent",),
+    ),
     Variable("lyapunov_history", "1/s", "exponent averaged up to this time", ("segment", "exponent")),
     Variable("sum_rule_residual", "1/s", "sum of the exponents minus the mean divergence"),
     Variable("paper_estimator", "1/s", "published estimate of the exponents, not a Lyapunov exponent", ("component",)),
-    Variable("chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic; 0 if the section repeats"),
+    Variable(
+        "chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic; 0 if the motion is on an orbit"
+    ),
     Variable("period_multiple", "1", "strobes after which the motion repeats (0: not found)", dtype="int32"),
     Variable(
         "verdict",
@@ -65,7 +74,9 @@ VARIABLES = (
     ),
 )
 OPTIONS = (
-    Parameter("standard_error", "1/s", "standard error at which a run may end", default=0.0, lower=0.0),
+    Parameter(
+        "standard_error", "1/s", "standard error at which a run without an orbit may end", default=0.0, lower=0.0
+    ),
     Parameter("max_time", "s", "longest time of a run", default=1.0, lower=0.0, upper=MOST_SECONDS, open_lower=True),
     Parameter(
         "steps",
@@ -127,17 +138,19 @@ class Run(NamedTuple):
     coarse: Record
 
 
-def run_twice(flow: Flow, steps: Any, max_time: float, target: float, members: Array) -> Run:
-    """Records of growth of the ``members`` with ``steps`` and with ``steps // 2`` per strobe.
+def run_twice(flow: Flow, steps: Any, max_time: float, target: float, members: Array, to_the_end: bool) -> Run:
+    """Records of growth of the ``members`` with ``steps`` and with ``steps // 2`` per strobe (:func:`record_growth`).
 
-    The second march is for members whose largest exponent is positive beyond its error. Both marches share one compiled
-    loop.
+    The second march is for members without an orbit whose largest exponent is positive beyond its error. Both marches
+    share one compiled loop.
     """
 
     def one(active: Array, steps: Array) -> tuple[Array, Record]:
-        record = record_growth(flow, steps, max_time, target, active)
+        record = record_growth(flow, steps, max_time, target, active, to_the_end=to_the_end)
         found = spectrum_of(record)
-        return active & record.bounded & (found.values[0] > STANDARD_ERRORS * found.errors[0]), record
+        return active & record.bounded & ~record.orbit.found & (
+            found.values[0] > STANDARD_ERRORS * found.errors[0]
+        ), record
 
     _, both = jax.lax.scan(one, members, jnp.stack([jnp.asarray(steps), jnp.maximum(steps // 2, 1)]))
     return Run(*(jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1)))
@@ -154,22 +167,17 @@ class Findings(NamedTuple):
 
 
 def findings_of(run: Run, period: Any) -> Findings:
-    """The spectra of both marches, the residual of the sum rule, and the result of their comparison."""
-    spectrum, coarse = spectrum_of(run.fine), spectrum_of(run.coarse)
+    """The spectra of both marches, the residual of the sum rule, and the result of their comparison.
+
+    The exponents of a motion on an orbit are those of the orbit.
+    """
+    spectrum, coarse, orbit = spectrum_of(run.fine), spectrum_of(run.coarse), run.fine.orbit
     residual = sum_rule_residual(run.fine, spectrum)
     sound = resolved(spectrum.values, spectrum.errors, residual, period, coarse.values[0], coarse.errors[0])
-    return Findings(spectrum, coarse, residual, sound)
-
-
-def evidence_of(flow: Flow, fine: Record, found: Findings, seen: Sampling) -> Evidence:
-    """The input of :func:`judge`."""
-    spectrum, coarse = found.spectrum, found.coarse
-    growing = grows(fine.size, fine.used, fine.span, spectrum.values[0])
-    return Evidence(
-        spectrum.values, spectrum.errors, coarse.values[0], coarse.errors[0], jnp.abs(found.residual), seen.k01,
-        fine.bounded, growing, seen.multiple, seen.settled, seen.returns, found.resolved,
-        may_be_chaotic(flow, fine.state),
-    )  # fmt: skip
+    values = jnp.where(orbit.found, orbit.exponents, spectrum.values)
+    errors = jnp.where(orbit.found, orbit.errors, spectrum.errors)
+    residual = jnp.where(orbit.found, jnp.sum(values, axis=0) - orbit.divergence, residual)
+    return Findings(spectrum._replace(values=values, errors=errors), coarse, residual, sound | orbit.found)
 
 
 def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
@@ -199,23 +207,36 @@ def _march(flow: Flow, request: Request, steps: Any, members: Array) -> dict[str
     if wanted == {"paper_estimator"}:
         finite = jnp.all(jnp.isfinite(results["paper_estimator"]), axis=0)
         return results | {"outcome": jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE).astype(jnp.int8)}
-    run = run_twice(flow, steps, max_time, target, members)
+    run = run_twice(flow, steps, max_time, target, members, "lyapunov_history" in wanted)
     found = findings_of(run, flow.period)
-    spectrum = found.spectrum
     results |= _of_spectrum(run.fine, found)
     if wanted & _SECTION:
-        # The verdict needs K unless the motion is forced and decays.
-        needed = spectrum.values[0] > -STANDARD_ERRORS * spectrum.errors[0] - zero_floor(spectrum.values)
-        needed = jnp.ones_like(needed) if "chaos_k01" in wanted or not flow.turns else needed
-        rate = spectrum.values[0] + STANDARD_ERRORS * spectrum.errors[0]
-        seen = sample(flow, steps, run.fine, rate, needed & members, members)
-        results["verdict"] = judge(evidence_of(flow, run.fine, found, seen), autonomous=not flow.turns)
-        # The test is meaningless for a few repeating points: K is set to 0, its limit for regular motion.
-        repeating = seen.multiple > 0
-        results["chaos_k01"] = jnp.where(repeating, 0.0, seen.k01)
-        results["period_multiple"] = seen.multiple.astype(jnp.int32)
+        results |= _of_section(flow, steps, run.fine, found, members & ("chaos_k01" in wanted))
     results["outcome"] = _outcome(run.fine, found, target)
     return {name: results[name] for name in (*request.outputs, "outcome")}
+
+
+def _of_section(flow: Flow, steps: Any, fine: Record, found: Findings, wanted: Array) -> dict[str, Array]:
+    """Verdict, K and period; K of motions without an orbit, if the verdict needs it or it is ``wanted``."""
+    spectrum, coarse, orbit, period = found.spectrum, found.coarse, fine.orbit, common_period(flow, fine.state)
+    decays = spectrum.values[0] < -STANDARD_ERRORS * spectrum.errors[0] - zero_floor(spectrum.values)
+    needed = wanted | ~decays if flow.turns else jnp.ones_like(decays)
+    seen = sample(flow, steps, fine, needed & ~orbit.found)
+    following = orbit.found | follows(fine.size, fine.used, fine.span, spectrum.values[0])
+    resting = may_rest(flow, fine.state)
+    # A rest is an orbit of any period, also of clocks that have none in common.
+    multiple = jnp.where((period == 0) & decays & following & resting, 1, orbit.multiple)
+    evidence = Evidence(
+        spectrum.values, spectrum.errors, coarse.values[0], coarse.errors[0], jnp.abs(found.residual), seen.k01,
+        fine.bounded, following, multiple, (period == 0) & ~resting, seen.returns, found.resolved,
+        may_be_chaotic(flow, fine.state),
+    )  # fmt: skip
+    return {
+        "verdict": judge(evidence, autonomous=not flow.turns),
+        # The test is meaningless for a few repeating points: K is set to 0, its limit for regular motion.
+        "chaos_k01": jnp.where(multiple > 0, 0.0, seen.k01),
+        "period_multiple": multiple.astype(jnp.int32),
+    }
 
 
 def _outcome(fine: Record, found: Findings, target: float) -> Array:
@@ -290,7 +311,7 @@ ANALYSIS = Analysis(
     default_outputs=("lyapunov_spectrum", "lyapunov_standard_error", "sum_rule_residual", "verdict"),
     methods={"benettin": tuple(option.name for option in OPTIONS)},
     method_titles={
-        "benettin": "the variational equations, orthonormalised again and again (Benettin)",
+        "benettin": "the variational equations: multipliers of an orbit, or averages (Benettin)",
     },
     options=OPTIONS,
     solvers=_solvers,

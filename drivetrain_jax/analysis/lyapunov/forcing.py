@@ -19,12 +19,12 @@ _PLANAR = 2
 
 def driven(flow: Flow, y: tuple[Array, ...]) -> Array:
     """Flags where the field at ``y`` depends on any of its clocks, shape (...), however small the amplitude."""
-    felt = [_felt(flow, y, number) for number in range(len(flow.turns))]
+    felt = [feels(flow, y, number) for number in range(len(flow.turns))]
     return jnp.any(jnp.stack([jnp.zeros(jnp.shape(y[0]), bool), *felt]), axis=0)
 
 
-def _felt(flow: Flow, y: tuple[Array, ...], number: int) -> Array:
-    """True where a turn of one clock changes any rate."""
+def feels(flow: Flow, y: tuple[Array, ...], number: int) -> Array:
+    """Flags where the field at ``y`` depends on the clock ``number``, shape (...), however small the amplitude."""
     shape = (len(FRACTIONS), *jnp.shape(y[0]))
     angles = flow.angles(0, jnp.asarray(FRACTIONS).reshape(-1, *(1,) * jnp.ndim(y[0])))
 
@@ -35,6 +35,14 @@ def _felt(flow: Flow, y: tuple[Array, ...], number: int) -> Array:
     angle = jnp.broadcast_to(angles[number], shape)
     _, change = jax.jvp(rates, (angle,), (jnp.ones_like(angle),))
     return jnp.any(change != 0, axis=(0, 1))
+
+
+def may_rest(flow: Flow, y: tuple[Array, ...]) -> Array:
+    """Flags where the field vanishes at 0, whatever the clocks show; only phases keep their values of ``y``."""
+    still = jnp.stack([x if i in flow.phases else jnp.zeros_like(x) for i, x in enumerate(y)])
+    rates = jnp.stack([flow.vector(0, fraction, still) for fraction in FRACTIONS])
+    moving = jnp.array([i for i in range(flow.size) if i not in flow.phases])
+    return jnp.all(rates[:, moving] == 0, axis=(0, 1))
 
 
 def may_be_chaotic(flow: Flow, y: tuple[Array, ...]) -> Array:

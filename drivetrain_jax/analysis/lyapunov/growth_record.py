@@ -16,6 +16,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from drivetrain_jax.analysis.lyapunov.march_steps import needed_parts
+from drivetrain_jax.analysis.lyapunov.orbit import Orbit, common_period, find_orbit, no_orbit
+from drivetrain_jax.analysis.lyapunov.resolution import STANDARD_ERRORS, adds_up
 from drivetrain_jax.analysis.lyapunov.variational import (
     Frame,
     Vector,
@@ -29,8 +31,8 @@ from drivetrain_jax.analysis.numerics.kernels import stored
 from drivetrain_jax.systems import Flow
 
 SEGMENTS = 64
-# Fractions of the time at which the standard error is tested.
-_CHECKS = (SEGMENTS // 4, SEGMENTS // 2, SEGMENTS)
+# Parts of the time after which orbits are looked for, and after the first one of which the standard error is tested.
+_CHECKS = (SEGMENTS // 16, SEGMENTS // 4, SEGMENTS // 2, SEGMENTS)
 # The first quarter of the record is transient; the rest is averaged in blocks.
 _DISCARD, BLOCKS = 4, 12
 # Number of standard errors above which the difference of the halves is drift, not scatter of the blocks.
@@ -53,7 +55,7 @@ class Record(NamedTuple):
     divergence, ``(SEGMENTS, ...)``; ``growth_moment``, ``contraction_moment``: the same sums with each strobe weighted by
     its place in the segment, from -1/2 to 1/2; ``size``: largest component (without phases and angles) at a strobe;
     ``used``: number of valid segments, ``(...)``; ``bounded``: true if the state stayed finite and within ``BOUND``;
-    ``state`` and ``strobe``: end of the march; ``span``: duration of a segment.
+    ``state`` and ``strobe``: end of the march; ``orbit``: the orbits found; ``span``: duration of a segment.
     """
 
     growth: Array
@@ -65,6 +67,7 @@ class Record(NamedTuple):
     bounded: Array
     state: Vector
     strobe: Array
+    orbit: Orbit
     span: Array
 
 
@@ -80,6 +83,7 @@ class _March(NamedTuple):
     contraction_moment: Array
     size: Array
     used: Array
+    orbit: Orbit
 
 
 def strobes_per_segment(flow: Flow, max_time: float) -> Array:
@@ -93,12 +97,15 @@ def state_size(flow: Flow, y: Vector) -> Array:
     return reduce(jnp.maximum, kept)
 
 
-def record_growth(flow: Flow, steps: Any, max_time: float, target: float, active: Array) -> Record:
-    """March until every member's standard error is below ``target``, at most ``max_time``, with ``steps`` per strobe.
+def record_growth(
+    flow: Flow, steps: Any, max_time: float, target: float, active: Array, *, to_the_end: bool = False
+) -> Record:
+    """March until every member is known to be on an orbit, or its standard error is below ``target``, with ``steps`` per
+    strobe; at most for ``max_time``. Members on an orbit go on if the record is wanted ``to_the_end``.
 
-    A decaying motion also continues until its transient is below e^-12. Each member stops on its own: its record does not
-    depend on the other members, except for rounding if one of them is orthonormalised within strobes. Members that are not
-    ``active`` do not start.
+    A decaying motion without an orbit also continues until its transient is below e^-12. Each member stops on its own: its
+    record does not depend on the other members, except for rounding if one of them is orthonormalised within strobes.
+    Members that are not ``active`` do not start.
     """
     frame = initial_frame(flow)
     shape = frame.state[0].shape
@@ -107,21 +114,25 @@ def record_growth(flow: Flow, steps: Any, max_time: float, target: float, active
     active = jnp.broadcast_to(active, shape)
     start = _March(
         frame, jnp.zeros(shape, jnp.int64), active, jnp.ones(shape, bool), jnp.int64(0),
-        growth, record, growth, record, record, jnp.zeros(shape, jnp.int64),
+        growth, record, growth, record, record, jnp.zeros(shape, jnp.int64), no_orbit(flow),
     )  # fmt: skip
     segment = one_kernel(flow)(_segment(flow, steps, needed_parts(flow, steps, active), length))
     span = length * flow.period
 
     def body(march: _March) -> _March:
         march = segment(march, jnp.max(jnp.where(march.alive, length, 0)))
-        return jax.lax.cond(
-            jnp.any(jnp.asarray(_CHECKS) == march.segment), lambda m: _stopped(m, span, target), lambda m: m, march
-        )
+        return jax.lax.cond(jnp.any(jnp.asarray(_CHECKS) == march.segment), check, lambda m: m, march)
+
+    def check(march: _March) -> _March:
+        reached, diverging = _reached(march, span, target)
+        march = march._replace(orbit=_orbit_of(flow, steps, march, span, reached, diverging))
+        on_orbit = march.orbit.found & (not to_the_end)
+        return march._replace(alive=march.alive & ~reached & ~on_orbit)
 
     march = jax.lax.while_loop(lambda m: (m.segment < SEGMENTS) & jnp.any(m.alive), body, start)
     return Record(
         march.growth, march.contraction, march.growth_moment, march.contraction_moment, march.size, march.used,
-        march.bounded, march.frame.state, march.strobe, span,
+        march.bounded, march.frame.state, march.strobe, march.orbit, span,
     )  # fmt: skip
 
 
@@ -173,19 +184,37 @@ def _segment(flow: Flow, steps: Any, parts: Array, length: Array) -> Callable[[_
         return _March(
             frame, number, alive, bounded, at + 1, march.growth.at[at].set(growth),
             march.contraction.at[at].set(frame.contraction), march.growth_moment.at[at].set(moments[0]),
-            march.contraction_moment.at[at].set(moments[1]), march.size.at[at].set(size), march.used + alive,
+            march.contraction_moment.at[at].set(moments[1]), march.size.at[at].set(size), march.used + alive, march.orbit,
         )  # fmt: skip
 
     return segment
 
 
-def _stopped(march: _March, span: Array, target: float) -> _March:
-    """The march without members whose standard error is small enough and whose transient has decayed."""
+def _reached(march: _March, span: Array, target: float) -> tuple[Array, Array]:
+    """Flags where the standard error is small enough and the transient has decayed, and where vectors grow beyond their
+    error."""
     mean, error, _ = mean_growth(march, span)
     largest = jnp.max(mean, axis=0)
     settled = (largest > 0) | (largest * march.used * span < -SETTLED)
-    reached = settled & (jnp.max(error, axis=0) <= target)
-    return march._replace(alive=march.alive & ~reached)
+    averaged = march.segment > _CHECKS[0]
+    reached = averaged & settled & (jnp.max(error, axis=0) <= target)
+    return reached, averaged & jnp.any(mean > STANDARD_ERRORS * error, axis=0)
+
+
+def _orbit_of(flow: Flow, steps: Any, march: _March, span: Array, reached: Array, diverging: Array) -> Orbit:
+    """Orbits of the march, with those of members whose motion the steps resolve and that do not diverge from where it is.
+
+    The volume of the vectors shows whether the steps resolve the motion. Multiples of the clocks' period are tried last.
+    """
+    time = march.used * span
+    rates, shrinking = jnp.sum(march.growth, axis=0) / time, jnp.sum(march.contraction, axis=0) / time
+    sound = adds_up(rates, jnp.zeros_like(rates), jnp.sum(rates, axis=0) - shrinking, flow.period)
+    resting = jnp.max(march.size, axis=0) == 0
+    wanted = march.alive & ~march.orbit.found & sound & (~diverging | resting)
+    last = reached | (march.segment == SEGMENTS)
+    period = common_period(flow, march.frame.state)
+    found = find_orbit(flow, steps, march.frame.state, march.strobe, period, wanted, wanted & last)
+    return jax.tree.map(lambda new, old: jnp.where(found.found, new, old), found, march.orbit)
 
 
 def block_size(used: Array) -> Array:

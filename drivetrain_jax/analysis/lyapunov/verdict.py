@@ -40,10 +40,10 @@ class Evidence(NamedTuple):
 
     ``spectrum``, ``error`` (m, ...): exponents and standard errors; ``coarse``, ``coarse_error`` (...): the largest exponent
     with twice the step, and its error; ``sum_residual``: residual of the sum rule; ``k01``: K of the 0-1 test;
-    ``bounded``: true if the motion stays bounded; ``growing``: see :func:`grows`; ``multiple``: strobes until the motion
-    repeats, 0 if it does not within the sample; ``settled``: true if the transient is small enough to decide;
-    ``returns``: true if it comes close to itself again and again without repeating, as on a torus; ``resolved``: see
-    :func:`~.resolution.resolved`; ``roomy``: true if the field can be chaotic.
+    ``bounded``: true if the motion stays bounded; ``following``: see :func:`follows`; ``multiple``: strobes of the motion's
+    orbit, 0 if none is found; ``aperiodic``: true if the clocks have no common period; ``returns``: true if the motion comes
+    close to itself again and again without repeating, as on a torus; ``resolved``: see :func:`~.resolution.resolved`;
+    ``roomy``: true if the field can be chaotic.
     """
 
     spectrum: Array
@@ -53,19 +53,19 @@ class Evidence(NamedTuple):
     sum_residual: Array
     k01: Array
     bounded: Array
-    growing: Array
+    following: Array
     multiple: Array
-    settled: Array
+    aperiodic: Array
     returns: Array
     resolved: Array
     roomy: Array
 
 
-def grows(size: Array, used: Array, span: Array, largest: Array) -> Array:
-    """Flags where the motion grew about as fast as its largest exponent, or stayed at an unstable rest.
+def follows(size: Array, used: Array, span: Array, largest: Array) -> Array:
+    """Flags where the motion grew or shrank about as fast as its largest exponent, or stayed at rest.
 
     ``size`` (SEGMENTS, ...): largest component in each segment. A chaotic attractor also has a positive exponent, but its
-    size does not grow. Growth so small that it may be in proportion to time does not count.
+    size does not grow. A change so small that it may be in proportion to time does not count.
     """
     index = jnp.arange(SEGMENTS).reshape(-1, *(1,) * used.ndim)
     last = jnp.maximum(used - 1, 0)
@@ -73,7 +73,8 @@ def grows(size: Array, used: Array, span: Array, largest: Array) -> Array:
     time = (last - used // 4) * span
     ratio = jnp.log(jnp.where((begin > 0) & (end > 0), end / jnp.where(begin > 0, begin, 1.0), 1.0))
     at_rest = jnp.max(size, axis=0) == 0
-    return (at_rest | (ratio > 0.5 * largest * time)) & (largest * time > TELLING)
+    predicted = largest * time
+    return (at_rest | (ratio * jnp.sign(predicted) > 0.5 * abs(predicted))) & (abs(predicted) > TELLING)
 
 
 def judge(evidence: Evidence, autonomous: bool) -> Array:
@@ -90,7 +91,7 @@ def judge(evidence: Evidence, autonomous: bool) -> Array:
 def _unstable(evidence: Evidence) -> Array:
     """Flags of motions that grow by a positive exponent; a torque may also drive a stable system beyond the bounds."""
     left = ~evidence.bounded & (evidence.spectrum[0] > 0)
-    return left | (significant(evidence.spectrum, evidence.error) & evidence.growing)
+    return left | (significant(evidence.spectrum, evidence.error) & evidence.following)
 
 
 def _chaotic(evidence: Evidence) -> Array:
@@ -101,17 +102,18 @@ def _chaotic(evidence: Evidence) -> Array:
 
 
 def _forced(evidence: Evidence) -> Array:
-    """Kind of an attracting motion, from the number of strobes after which it repeats.
+    """Kind of an attracting motion, from its orbit, or from clocks that never repeat.
 
     A motion with a frequency of its own has one zero exponent. It is a torus if it also returns, which a decay slower than
     exponential does not.
     """
     zeros = _zeros(evidence)
     decays = evidence.spectrum[0] < -STANDARD_ERRORS * evidence.error[0] - zero_floor(evidence.spectrum)
-    kind = jnp.where(evidence.multiple > 1, Verdict.PERIODIC, Verdict.QUASI_PERIODIC)
+    kind = jnp.where(evidence.aperiodic, Verdict.QUASI_PERIODIC, Verdict.UNDECIDED)
+    kind = jnp.where(evidence.multiple > 1, Verdict.PERIODIC, kind)
     kind = jnp.where(evidence.multiple == 1, Verdict.FIXED_POINT, kind)
     torus = zeros[0] & (jnp.sum(zeros, axis=0) == 1) & evidence.returns & (evidence.k01 < 1 - CHAOTIC_K)
-    kind = jnp.where(decays & evidence.settled, kind, Verdict.UNDECIDED)
+    kind = jnp.where(decays, kind, Verdict.UNDECIDED)
     return jnp.where(torus, Verdict.QUASI_PERIODIC, kind)
 
 
