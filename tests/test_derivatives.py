@@ -334,7 +334,8 @@ def test_where_there_is_no_derivative_there_is_none():
     """All multipliers are on the unit circle."""
     undamped = dt.Cardan(beta=0.3, Omega=1.2, zeta=0.0, alpha=1.0, mu=1.0, gamma=100.0)
     slopes = quick_jit(jax.jacrev(floquet_radius))(undamped)
-    assert all(np.isnan(x) for x in jax.tree.leaves(slopes))
+    # The initial state of motions has no part in it.
+    assert all(np.isnan(getattr(slopes, name)) for name in dt.Cardan.models["floquet"].parameters)
 
 
 @pytest.mark.full

@@ -209,7 +209,7 @@ def declared(units="1", roles=(), model=None, **serving):
         (lambda: dt.floquet(SHAFT, rtol=1.0), "rtol = 1.0: allowed is"),
         (lambda: dt.floquet(SHAFT, rtoll=1e-9), "rtoll = 1e-09: not used by method auto"),
         (lambda: dt.floquet(SHAFT, outputs="radius"), "outputs: 'radius' is not a result of floquet"),
-        (lambda: dt.modes(SHAFT), "modes: unknown to cardan; allowed is one of floquet, atlas, forced"),
+        (lambda: dt.modes(SHAFT), "modes: unknown to cardan; allowed is one of floquet, atlas, history, lyapunov, forced"),
         (lambda: dt.forced(dt.Planetary()), "forced: unknown to planetary; allowed is one of"),
         (lambda: jax.hessian(lambda s: dt.floquet(s).spectral_radius)(SHAFT), "floquet: got a second derivative"),
         (lambda: dt.floquet(3.0), "system: got a float; allowed is a system"),

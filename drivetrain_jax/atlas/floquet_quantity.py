@@ -65,7 +65,7 @@ def results_of_propagator(
     model = build(values)
     form, n = model.reduced, model.reduced.size
     matrix = phi.reshape(n, n, -1)
-    z = assemble(form, matrix)
+    z = assemble(form.ends(), matrix)
     a = characteristic_coefficients(z)
     spectrum = eigenvalues(z)
     rho = jnp.max(jnp.hypot(*spectrum), axis=0)

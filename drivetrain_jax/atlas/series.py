@@ -15,8 +15,7 @@ from jax import Array
 
 from drivetrain_jax._machine import usable_cores
 from drivetrain_jax._threads import threads
-from drivetrain_jax.analysis.floquet.direct import stable_steps
-from drivetrain_jax.analysis.floquet.effort import explicit_effort
+from drivetrain_jax.analysis.floquet.effort import stable_steps, steps_needed
 from drivetrain_jax.analysis.floquet.power_series import propagators_along
 from drivetrain_jax.analysis.numerics.kernels import compiler_options
 from drivetrain_jax.analysis.numerics.predictions import Words, predicted, split
@@ -27,14 +26,14 @@ from drivetrain_jax.systems import FloquetModel, LinearPeriodic, Series, System
 _LANES, _POSITIONS = 16, 48
 # Parts of the span per step of the explicit scheme at 1e-10, with a truncation error of 3e-14 of the propagator. Reduction
 # in parts per decade of looser tolerance (four at most). Parts per step of decay.
-_PARTS, _LEAST, _SPARED, _MOST_SPARED, _DECAY = 0.1, 3e-14, 0.0095, 4, 3.0
+_PARTS, _LEAST, _SPARED, _MOST_SPARED, _DECAY = 0.11, 3e-14, 0.0105, 4, 3.0
 # Largest truncation error relative to the tolerance; a line above it is computed again with twice the parts.
 _SHARPER, _MOST_PARTS = 1e-2, 4_000
 # Tolerance below which rounding of the parts shows in their product. Many steps of decay have the same effect, because the
 # product is then small.
 _TOO_FINE, _STIFF = 5e-13, 50
 # Settings at which steps are predicted, and the angle of one step.
-_STEPS_AT, _RADIANS = 1e-10, 0.14
+_STEPS_AT, _RADIANS = 1e-10, 0.155
 
 Key = tuple[Callable[..., FloquetModel], Series, tuple[str, ...], Words, tuple[tuple[str, tuple[int, ...]], ...]]
 
@@ -122,7 +121,7 @@ class SeriesNodes:
         """The parameters of all lines on a grid, except the one of the series, and the number of steps of each line."""
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
         columns = dict(zip(self._domain.parameters, self._domain.points(grid).T, strict=True))
-        steps = explicit_effort(self._system, {**self._domain.fixed, **columns}, _STEPS_AT)
+        steps = steps_needed(self._system, {**self._domain.fixed, **columns}, _STEPS_AT)
         return {name: column for name, column in columns.items() if name != self._series.parameter}, steps
 
     def _along(

@@ -110,9 +110,10 @@ class LinearPeriodic(eqx.Module):
 
     @property
     def is_pytree(self) -> bool:
-        """True if ``rows`` is a pytree; any other function may depend on unknown arrays."""
+        """True if all functions are pytrees; any other function may depend on unknown arrays."""
         rows = self.rows.rows if isinstance(self.rows, _Piece) else self.rows
-        return isinstance(rows, eqx.Module | jax.tree_util.Partial)
+        functions = rows, self.log_determinant, self.reversal
+        return all(isinstance(f, eqx.Module | jax.tree_util.Partial | None) for f in functions)
 
     @property
     def halves(self) -> int:
@@ -123,6 +124,22 @@ class LinearPeriodic(eqx.Module):
     def size(self) -> int:
         """Number of states."""
         return len(self.square_rows(*self.basis(0.0)))
+
+    @property
+    def displacement_unit(self) -> Any:
+        """u if the system is ``q' = u p, p' = P q + E p`` with a constant u, which its rows show as the numbers 0 and 1."""
+        rows, unit = (self.rows.rows, self.rows.length) if isinstance(self.rows, _Piece) else (self.rows, 1.0)
+        matrix = rows(*self.basis(0.0))
+        half = len(matrix) // 2
+        upper = [(entry, j == i + half) for i in range(half) for j, entry in enumerate(matrix[i])]
+        is_pair = len(matrix) == 2 * half and all(isinstance(x, int | float) and x == one for x, one in upper)
+        return unit if is_pair else None
+
+    def ends(self) -> tuple[Rows, Rows] | None:
+        """``R0`` and ``R1`` of the reversal, or the reversor twice; None over a whole period."""
+        if self.reversal is not None:
+            return self.reversal()
+        return None if self.reversor is None else (self.reversor, self.reversor)
 
     @property
     def exchanges_halves(self) -> bool:
@@ -164,21 +181,26 @@ class FloquetModel(eqx.Module):
     """The model of the analysis ``floquet``.
 
     ``natural`` is the system as published, over its full period in its own time. ``reduced`` is an equivalent form (same
-    multipliers) that is cheaper or better conditioned; both may be the same object. ``explicit_steps(rtol)`` predicts the
-    number of steps of ``reduced`` by the explicit scheme of order 8, from parameters as NumPy arrays of shape ``(N,)`` or
-    traced arrays; None leaves the prediction to the analysis. ``hamiltonian()`` is true where ``reduced`` is a Hamiltonian
-    system (without damping), whose multipliers come in pairs sigma, 1/sigma; None: where the states of ``natural`` are
-    coordinates and momenta, as for x'' = -K(t) x with a symmetric K. ``stiff`` is a form for strong damping, whose
-    slow modes are not differences of large entries; None if ``reduced`` is as good. The implicit scheme always uses
-    ``stiff``, the explicit scheme where ``strongly_damped()`` is true; None means nowhere.
+    multipliers) of an atlas. ``direct`` integrates ``marched``, a form over the same clock; None stands for ``reduced``, and
+    all may be the same object. It integrates ``damped`` where ``strongly_damped()`` is true, a form whose slow modes are not
+    differences of large entries; None means nowhere. ``panels(rtol)`` predicts the panels of Gauss collocation, from
+    parameters as NumPy arrays of shape ``(N,)`` or traced arrays; None leaves the prediction to the analysis.
+    ``hamiltonian()`` is true where ``reduced`` is a Hamiltonian system (without damping), whose multipliers come in pairs
+    sigma, 1/sigma; None: where the states of ``natural`` are coordinates and momenta, as for x'' = -K(t) x with symmetric K.
     """
 
     natural: LinearPeriodic
     reduced: LinearPeriodic
-    explicit_steps: Callable[[float], Any] | None = None
-    hamiltonian: Callable[[], Any] | None = None
-    stiff: LinearPeriodic | None = None
+    marched: LinearPeriodic | None = None
+    damped: LinearPeriodic | None = None
     strongly_damped: Callable[[], Any] | None = None
+    panels: Callable[[float], Any] | None = None
+    hamiltonian: Callable[[], Any] | None = None
+
+    @property
+    def direct(self) -> LinearPeriodic:
+        """The form that ``direct`` integrates."""
+        return self.reduced if self.marched is None else self.marched
 
     def is_hamiltonian(self) -> Any:
         """True without damping: as declared, else where ``J A`` of ``natural`` is symmetric at all of some instants."""

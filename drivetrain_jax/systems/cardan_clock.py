@@ -5,7 +5,6 @@ Equation numbers are those of docs/theory/cardan.md.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import jax.numpy as jnp
@@ -17,8 +16,8 @@ def clock_basis(psi: Any) -> tuple[Array, Array]:
     return jnp.cos(2 * psi), jnp.sin(2 * psi)
 
 
-def clock(cos2psi: Any, sin2psi: Any, beta: Any) -> tuple[Any, Any, Any]:
-    """``eta``, ``dtau/dpsi`` and ``deta/dpsi`` in the clock psi, eqs (11)-(12).
+def clock(cos2psi: Any, sin2psi: Any, beta: Any) -> tuple[Any, Any, Any, Any]:
+    """``eta``, ``w = dtau/dpsi``, ``deta/dpsi`` and ``d(ln w)/dpsi`` in the clock psi, eqs (11)-(12).
 
     Two Landen steps lead from tau to psi. The first, tan(chi) = sqrt(cos beta) tan(tau), distributes the poles of eta near
     pi/2 to 0 and pi/2. The second, tan(2 chi) = kappa tan(2 psi) with kappa^2 = 1 - r^2 and r = tan(beta/2)^2, moves these
@@ -40,20 +39,14 @@ def clock(cos2psi: Any, sin2psi: Any, beta: Any) -> tuple[Any, Any, Any]:
     inverse_plus = minus * root * inverse
     eta = minus * inverse_plus
     w = 2 * jnp.sqrt(c * kappa2) / (1 + c) * plus * inverse
-    return eta, w, 4 * r * kappa2 * sin2psi * inverse_plus * minus * inverse
+    # w is a constant over minus and root, minus = root - r cos 2psi, and 1 - kappa^2 = r^2.
+    turn = -2 * r * sin2psi * minus * (minus * plus * inverse) ** 2
+    return eta, w, 4 * r * kappa2 * sin2psi * inverse_plus * minus * inverse, turn
 
 
-def oscillation_steps(xp: Any, phase: Any, sharpness: Any, digits: float) -> Any:
-    """Steps of order 8 for the ``phase`` over half a period; fitted, see ``Cardan.explicit_steps``."""
-    x, bend = xp.log(phase), 2.57
-    capped = xp.minimum(x, bend)
-    # Limited, because rounding dominates beyond 1e-10, and more steps would move points to the implicit scheme.
-    power = 1.13 + 0.01 * digits if digits <= 1 else 1.1
-    log_steps = 0.59 * capped + 0.1 * capped**2 + power * (x - capped)
-    return xp.exp(log_steps + (0.59 - 0.13 * capped - 0.034 * sharpness) * sharpness + 1.7 + 0.26 * digits)
-
-
-def decay_steps(xp: Any, decay: Any, digits: float) -> Any:
-    """Steps of order 8 for the ``decay`` over half a period; fitted, see ``Cardan.explicit_steps``."""
-    accurate = math.exp(1.35 + 0.36 * digits) * decay ** (0.79 - 0.027 * digits)
-    return xp.maximum(accurate, decay / 3.2)
+def panels_needed(xp: Any, phase: Any, sharpness: Any, decay: Any, digits: float) -> Any:
+    """Panels of Gauss collocation over half a period; fitted, see ``Cardan.panels``."""
+    x, y, z = xp.log(xp.maximum(phase, 1.0)), sharpness, xp.log(xp.maximum(decay, 1.0))
+    light = 0.78 + 0.315 * x + 0.136 * x**2 + (0.5 - 0.128 * x + 0.022 * digits) * y + 0.2 * digits
+    heavy = 1.08 + (0.278 + 0.062 * x) * x + 0.413 * y + (0.201 + 0.02 * z - 0.051 * y - 0.062 * x) * z + 0.182 * digits
+    return xp.exp(xp.where(decay > 3, heavy, light))

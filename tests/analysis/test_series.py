@@ -9,8 +9,6 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis.floquet.power_series import propagators_along
-from drivetrain_jax.runs.resolve import resolve
-from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import LinearPeriodic
 from tests.oracles.atlas_direct import BASE, CARDAN, monodromy, propagators
 
@@ -92,8 +90,8 @@ def test_lines_of_the_cardan_shaft_against_direct_solves(change, steepest):
 
 
 @pytest.mark.full
-def test_very_slow_speeds_are_marched_explicitly_and_apart():
-    """Omega = 0.001 needs 21,000 steps; the implicit scheme would cost 26 times as much. Reference: power series."""
+def test_very_slow_speeds():
+    """Omega = 0.001 needs 10,000 panels. Reference: power series."""
     omega = [1.0, 1e-3, 1.1e-3]
     scene = {
         "system": "cardan",
@@ -103,11 +101,6 @@ def test_very_slow_speeds_are_marched_explicitly_and_apart():
         "fixed": {**BASE, "beta": 1.2},
         "options": {"method": "direct"},
     }
-    engine = resolve(load_scene(scene))
-    assert [(group.solver.name.split(", ")[-1], group.size) for group in engine.plan.groups] == [
-        ("direct: explicit Runge-Kutta of order 8", 1),
-        ("long marches", 2),
-    ]
     found = dt.run(scene)
 
     def form(parameter):
@@ -121,6 +114,3 @@ def test_very_slow_speeds_are_marched_explicitly_and_apart():
     assert float(left_out[0]) < 1e-13
     assert (np.abs(found.spectral_radius - exact) <= found.spectral_radius_error).all()
     assert found.spectral_radius.values == pytest.approx(exact, abs=1e-11)
-    # Long marches of other points do not affect the accuracy of the first point.
-    alone = dt.run(scene | {"points": {"Omega": omega[:1]}})
-    assert float(found.spectral_radius_error[0]) == pytest.approx(float(alone.spectral_radius_error[0]), rel=1e-3)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivetrain_jax.analysis.floquet.effort import explicit_effort
+from drivetrain_jax.analysis.floquet.effort import steps_needed
 from drivetrain_jax.analysis.floquet.power_series import propagators_along
 from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.atlas import Domain, Quantity, construct, run, values_at
@@ -244,7 +244,7 @@ def test_parts_by_predicted_steps_are_short_enough():
     }
     omega, build = 0.1, CARDAN.models["floquet"].build
     decay = predicted(series_module._stable_steps, (build,), columns | {"Omega": np.full(lanes, omega)})
-    steps = explicit_effort(CARDAN, columns | {"Omega": np.full(lanes, omega)}, series_module._STEPS_AT)
+    steps = steps_needed(CARDAN, columns | {"Omega": np.full(lanes, omega)}, series_module._STEPS_AT)
     parts = np.maximum(np.ceil(series_module._PARTS * steps), 1 + np.ceil(series_module._DECAY * decay))
     ends, x = jnp.array([np.inf, omega]), jnp.array([1.0, 0.7, -0.2])
     along = jax.jit(

@@ -5,16 +5,17 @@ The solves are jitted once for all tolerances and parameter sets, as a short for
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drivetrain_jax.analysis import Request
+from drivetrain_jax.analysis import Request, Solver
 from drivetrain_jax.analysis.atlas.solves import ANALYSIS
+from drivetrain_jax.analysis.numerics.kernels import compiler_options
 from drivetrain_jax.atlas import StabilityAtlas, floquet_rounds, run, solve_rtol, stability_atlas
 from drivetrain_jax.systems import get_system
 
@@ -22,22 +23,20 @@ CARDAN = get_system("cardan")
 BASE = dict(CARDAN.presets["base"])
 NAMES = CARDAN.models["floquet"].parameters
 OUTPUTS = ANALYSIS.default_outputs
-_SIZES = (512, 16, 64)
+_SIZE = 512
 
 
-def solvers(rtol: float) -> Sequence[Any]:
-    """The solvers of the method ``direct`` for the propagator."""
-    return ANALYSIS.solvers(CARDAN, Request(OUTPUTS, "direct", {"rtol": rtol}))
+def direct_solver(rtol: float) -> Solver:
+    """The solver of the method ``direct`` for the propagator."""
+    (solver,) = ANALYSIS.solvers(CARDAN, Request(OUTPUTS, "direct", {"rtol": rtol}))
+    return solver
 
 
-@cache
-def _batch(index: int) -> Callable[..., jax.Array]:
-    def batch(values: Mapping[str, Any], effort: Any, rtol: Any) -> jax.Array:
-        solver = solvers(rtol)[index]
-        found = solver.solve(values, effort)
-        return jnp.concatenate([found[name] for name in OUTPUTS])
-
-    return jax.jit(batch)
+# Optimised: thousands of solves take longer than their compilation.
+@partial(jax.jit, compiler_options=compiler_options(_SIZE, march=True, short_loops=True))
+def _batch(values: Mapping[str, Any], effort: Any, rtol: Any) -> jax.Array:
+    found = direct_solver(rtol).solve(values, effort)
+    return jnp.concatenate([found[name] for name in OUTPUTS])
 
 
 def propagators(columns: Mapping[str, Any], rtol: float = 1e-13) -> np.ndarray:
@@ -49,16 +48,11 @@ def solves(columns: Mapping[str, Any], rtol: float) -> np.ndarray:
     """Propagators followed by their errors, ``(N, 32)``; points of similar effort are solved together."""
     given = np.broadcast_arrays(*(np.atleast_1d(np.asarray(columns[name], float)) for name in NAMES))
     points = dict(zip(NAMES, given, strict=True))
-    efforts = np.stack([np.asarray(s.effort(points), float) * s.unit_cost for s in solvers(rtol)])
-    choice = np.argmin(efforts, axis=0)
-    out = np.empty((choice.size, 32))
-    for index, size in enumerate(_SIZES):
-        mine = np.flatnonzero(choice == index)
-        mine = mine[np.argsort(efforts[index, mine], kind="stable")]
-        for part in (mine[i : i + size] for i in range(0, mine.size, size)):
-            padded = {name: np.pad(x[part], (0, size - part.size), mode="edge") for name, x in points.items()}
-            effort = np.int64(efforts[index, part].max() / solvers(rtol)[index].unit_cost)
-            out[part] = np.asarray(_batch(index)(padded, effort, rtol)).T[: part.size]
+    efforts = np.asarray(direct_solver(rtol).effort(points), float)
+    out, order = np.empty((efforts.size, 32)), np.argsort(efforts, kind="stable")
+    for part in (order[i : i + _SIZE] for i in range(0, order.size, _SIZE)):
+        padded = {name: np.pad(x[part], (0, _SIZE - part.size), mode="edge") for name, x in points.items()}
+        out[part] = np.asarray(_batch(padded, np.int64(efforts[part].max()), rtol)).T[: part.size]
     return out
 
 

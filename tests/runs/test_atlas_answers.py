@@ -435,7 +435,7 @@ def test_gradients_at_extremes(point):
 @pytest.mark.full
 def test_steps_of_a_gradient_are_found_where_the_system_predicts_none():
     model = CARDAN.models["floquet"]
-    other = replace(model, build=lambda values: replace(model.build(values), explicit_steps=None))
+    other = replace(model, build=lambda values: replace(model.build(values), panels=None))
     system = type("Variant", (CARDAN,), {"models": CARDAN.models | {"floquet": other}})
     point = {"beta": 0.3, "Omega": 0.004, "zeta": 1e-4, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
     found, exact = (atlas_answers.radius_gradient(s, point) for s in (system, CARDAN))

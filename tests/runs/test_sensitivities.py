@@ -92,10 +92,11 @@ def test_a_system_in_seconds_has_a_rate():
 
 
 def test_undecided_says_what_to_do():
-    undamped = {"beta": 0.3, "Omega": 1.4, "zeta": 0.0, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+    """Where an undamped tongue begins, two multipliers are -1."""
+    undamped = {"beta": 0.0, "Omega": 1.41598463971976, "zeta": 0.0, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
     found = dt.point("cardan", "floquet", **undamped)
     assert found.verdict == 2 and found.growth == {}
-    assert "a smaller rtol than 1e-10 may decide; without damping only damping does" in repr(found)
+    assert "a smaller rtol than 1e-10 may decide" in repr(found)
 
 
 def test_a_point_without_result_has_no_sensitivities():

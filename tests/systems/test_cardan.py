@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +12,7 @@ import pytest
 from mpmath import mp
 from scipy.integrate import quad
 
-from drivetrain_jax.analysis.floquet.direct import assemble, compare, stable_steps
-from drivetrain_jax.analysis.floquet.propagator import EXPLICIT_ORDER, propagator
+from drivetrain_jax.analysis.floquet import propagator
 from drivetrain_jax.resonances.cardan import natural_frequencies
 from drivetrain_jax.systems import cardan, get_system, system_names
 
@@ -38,12 +38,12 @@ def relative(found, exact) -> float:
 
 @pytest.fixture(scope="module")
 def model_matrices():
-    """``A`` of the natural, the reduced and the stiff form, each at an instant of its clock."""
+    """``A`` of the natural, the reduced, the absolute and the twist form, each at an instant of its clock."""
 
     @jax.jit
     def both(values, tau, psi):
         model = SYSTEM.models["floquet"].build(values)
-        return model.natural.matrix(tau), model.reduced.matrix(psi), model.stiff.matrix(psi)
+        return model.natural.matrix(tau), *(form.matrix(psi) for form in (model.reduced, model.marched, model.damped))
 
     return lambda values, tau=0.0, psi=0.0: tuple(map(np.asarray, both(values, tau, psi)))
 
@@ -86,6 +86,20 @@ def exact_twists(v, tau):
     g, omega = 1 / mp.sqrt(v["gamma"]), mp.mpf(v["Omega"])
     second = [omega * first / g, 0, omega * eta / g, omega / g]
     return mp.matrix([[1, 0, 0, 0], [0, mp.sqrt(v["mu"]), 0, 0], [0, 0, omega, 0], second])
+
+
+def exact_absolute(v, tau):
+    """``(q, q_psi) = T (theta, theta')``."""
+    c, r = mp.cos(v["beta"]), mp.tan(mp.mpf(v["beta"]) / 2) ** 2
+    doubled = 2 * mp.atan2(mp.sqrt(c) * mp.sin(tau), mp.cos(tau))
+    psi, step = mp.atan2(mp.sin(doubled), mp.sqrt(1 - r**2) * mp.cos(doubled)) / 2, mp.mpf(10) ** -20
+    # Towards the middle: the clock of the half period ends at both ends.
+    step = step if psi < 0.6 else -step
+    rate = (exact_time(v["beta"], psi + step) - exact_time(v["beta"], psi)) / step
+    eta, first, _ = exact_ratio(v["beta"], tau)
+    g = 1 / mp.sqrt(v["gamma"])
+    second = [rate * first / g, 0, rate * eta / g, rate / g]
+    return mp.matrix([[1, 0, 0, 0], [eta / g, 1 / g, 0, 0], [0, 0, rate, 0], second])
 
 
 def exact_time(beta, psi):
@@ -139,25 +153,26 @@ def test_forcing_is_what_the_nonlinear_equations_have_at_rest():
 
 
 @pytest.mark.parametrize("point", range(len(POINTS)))
-def test_both_forms_are_the_transformed_natural_system(point, model_matrices):
+def test_all_forms_are_the_transformed_natural_system(point, model_matrices):
     v = POINTS[point]
     for psi in (0.0, 0.1, 0.7, math.pi / 4, 0.9, 1.5):
-        _, reduced, stiff = model_matrices(v, psi=psi)
-        assert relative(reduced, exact_form(v, psi, exact_transformation)) <= 3e-14
-        assert relative(stiff, exact_form(v, psi, exact_twists)) <= 3e-14
+        found = model_matrices(v, psi=psi)[1:]
+        for form, transformation in zip(found, (exact_transformation, exact_absolute, exact_twists), strict=True):
+            assert relative(form, exact_form(v, psi, transformation)) <= 3e-14
 
 
 @pytest.mark.parametrize("point", range(len(POINTS)))
-def test_the_stiff_form_runs_back_as_the_reduced_one_does(point):
-    """R0 = Y^-1 X Y^-T at the start, R1 = Y^T X Y at the end, with (q, P) = Y (x, v)."""
+def test_other_forms_run_back_as_the_reduced_one_does(point):
+    """R0 = Y^-1 X Y^-T at the start, R1 = Y^T X Y at the end, with (q, P) = Y times the states of the form."""
     v = POINTS[point]
-    start, end = cardan.Cardan(**v).floquet_model().stiff.reversal()
-    with mp.workdps(60):
-        swap = mp.matrix(cardan.Cardan(**v).floquet_model().reduced.reversor)
-        first, last = (exact_transformation(v, tau) * exact_twists(v, tau) ** -1 for tau in (mp.mpf(0), mp.pi / 2))
-        exact = first**-1 * swap * (first**-1).T, last.T * swap * last
-        for found, e in zip((start, end), exact, strict=True):
-            assert relative(np.array(found, float), e.tolist()) <= 1e-14
+    model = cardan.Cardan(**v).floquet_model()
+    for form, transformation in ((model.marched, exact_absolute), (model.damped, exact_twists)):
+        with mp.workdps(60):
+            swap = mp.matrix(model.reduced.reversor)
+            first, last = (exact_transformation(v, t) * transformation(v, t) ** -1 for t in (mp.mpf(0), mp.pi / 2))
+            exact = first**-1 * swap * (first**-1).T, last.T * swap * last
+            for found, e in zip(form.reversal(), exact, strict=True):
+                assert relative(np.array(found, float), e.tolist()) <= 1e-14
 
 
 @pytest.mark.parametrize("beta", [0.0, 0.4, -1.2, 1.5, NEAR_PERPENDICULAR])
@@ -270,17 +285,17 @@ def test_parameter_ranges(name, good, bad):
             parameter.check(value)
 
 
-def test_explicit_steps_grow_with_what_makes_a_point_harder():
+def test_predicted_panels_grow_with_what_makes_a_point_harder():
     base = {"beta": 0.5, "Omega": 0.5, "zeta": 0.01, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 
-    def steps(rtol=1e-10, **changed):
-        return cardan.Cardan(**(base | changed)).explicit_steps(rtol)
+    def panels(rtol=1e-10, **changed):
+        return cardan.Cardan(**(base | changed)).panels(rtol)
 
-    easy = steps()
+    easy = panels()
     for harder in ({"Omega": 0.1}, {"beta": 1.4}, {"mu": 20.0}, {"zeta": 5.0}, {"gamma": 1e-2}):
-        assert steps(**harder) > 1.2 * easy, harder
-    assert steps(1e-13) > 1.5 * easy
-    assert steps(beta=np.linspace(0, 1, 7)).shape == (7,)
+        assert panels(**harder) > 1.2 * easy, harder
+    assert panels(1e-13) > 1.5 * easy
+    assert panels(beta=np.linspace(0, 1, 7)).shape == (7,)
 
 
 def test_systems_are_found_by_name():
@@ -292,40 +307,20 @@ def test_systems_are_found_by_name():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(
-    ("point", "rtol"),
-    [
-        ({"beta": 1.0, "Omega": 0.1, "zeta": 10.0}, 1e-9),
-        ({"beta": 0.5, "Omega": 0.1, "zeta": 3.0}, 1e-7),
-        ({"beta": 1.4, "Omega": 0.1, "zeta": 3.0}, 1e-11),
-        ({"beta": 1.0, "Omega": 0.02, "zeta": 10.0}, 1e-5),
-        ({"beta": 0.8, "Omega": 0.5, "zeta": 0.0}, 1e-9),
-    ],
-)
-def test_predicted_steps_are_enough_and_not_many_more(point, rtol):
-    """A decay is limited by stability and not by accuracy, and needs fewer steps than an oscillation of the same rate."""
-    shaft = cardan.Cardan(alpha=1.0, mu=1.0, gamma=100.0, **point)
-    form, predicted = shaft.floquet_model().reduced, int(shaft.explicit_steps(rtol))
-    exact = assemble(form, propagator(form, jnp.int32(8 * predicted)).matrix)
+@pytest.mark.parametrize("rtol", [1e-10, 1e-7])
+def test_predicted_panels_are_enough_and_not_many_more(rtol, monkeypatch):
+    """Too few panels repeat a block of lanes with twice as many."""
+    monkeypatch.setattr(propagator, "_MAX_REFINEMENTS", 0)
+    rng, count = np.random.default_rng(3), 500
+    points = {"beta": rng.uniform(0, 1.5, count), "Omega": np.exp(rng.uniform(np.log(0.03), np.log(3), count))}
+    shaft = partial(cardan.Cardan, zeta=1e-3, alpha=1.0, mu=1.0, gamma=100.0)
 
-    def error(steps: int) -> float:
-        z = assemble(form, propagator(form, jnp.int32(steps)).matrix)
-        return float(jnp.linalg.norm(z - exact) / jnp.max(jnp.abs(jnp.linalg.eigvals(exact))))
+    def met(part):
+        # One at a time, because lanes share the largest number of panels.
+        def one(p):
+            panels = jnp.ceil(part * shaft(**p).panels(rtol)).astype(int)
+            return propagator.monodromy(shaft(**p).floquet_model().direct, panels, rtol / 4, 4).met
 
-    # An overflow counts as an error.
-    assert error(predicted) < rtol and not error(predicted // 4) <= rtol
-    assert stable_steps(form) < predicted
+        return np.mean(jax.jit(lambda points: jax.lax.map(one, points))(points))
 
-
-@pytest.mark.full
-@pytest.mark.parametrize("rtol", [1e-9, 1e-7, 1e-10])
-def test_slow_points_meet_their_tolerance_in_predicted_steps(rtol):
-    """Slightly too few steps would repeat the march with twice as many, and cost 2.6 times the time of a block."""
-    for omega, beta in ((0.006, 0.9), (0.01, 0.3), (0.03, 0.1)):
-        point = {"beta": beta, "Omega": omega, "zeta": 1e-3, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
-        shaft = cardan.Cardan(**point)
-        form, steps = shaft.floquet_model().reduced, int(shaft.explicit_steps(rtol))
-        few = -(-steps // 4)
-        coarse, fine = (propagator(form, jnp.int32(n)) for n in (few, steps))
-        found = compare(form, coarse, fine, steps, 0.0, rtol, (steps / few) ** EXPLICIT_ORDER - 1)
-        assert found.met and float(found.error) < rtol, omega
+    assert met(1.0) > 0.99 and met(0.5) < 0.4

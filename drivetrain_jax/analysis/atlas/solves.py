@@ -8,12 +8,13 @@ Scenes name the analysis ``atlas`` (``analysis/atlas/analysis.py``), so these so
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 from jax import Array
+from jax.tree_util import Partial
 
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
@@ -31,15 +32,18 @@ VARIABLES = (
     Variable(CHANGE, "1", "estimated error of the propagator, by rows", ("entry",)),
 )
 # An atlas asks for a hundred points at a time: large chunks would leave most lanes, and a core, without work.
-_CHUNKS = (32, 16)
+_CHUNK = 32
 
 
 def whole_span(form: LinearPeriodic) -> LinearPeriodic:
     """``form`` with its span as period: the monodromy matrix is then the propagator itself."""
     if form.reversor is None or form.log_determinant is None:
         return replace(form, reversor=None)
-    exact = form.log_determinant
-    return replace(form, reversor=None, log_determinant=lambda: exact() / 2)
+    return replace(form, reversor=None, log_determinant=Partial(_half, form.log_determinant))
+
+
+def _half(function: Callable[[], Array]) -> Array:
+    return function() / 2
 
 
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
@@ -50,7 +54,7 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
         rtol,
         lambda model: whole_span(model.reduced),
         lambda model, phi: _results(phi, request.outputs),
-        _CHUNKS,
+        _CHUNK,
     )
 
 

@@ -1,12 +1,13 @@
-"""The adjoint of the explicit march of order 8: gradients of sums of entries of a propagator by parameters.
+"""The discrete adjoint of the march by Gauss collocation: gradients of sums of entries of a propagator by parameters.
 
-With the propagators ``P_k`` of the steps the change of ``sum(W * Phi)`` is the sum over k of
+With the propagators ``P_k`` of the panels the change of ``sum(W * Phi)`` is the sum over k of
 ``(P_K ... P_{k+1})^T W (P_{k-1} ... P_1)^T * dP_k``, entry by entry. The factors on the right are marched forwards and those
-on the left backwards; states are kept on two levels, and the steps between two of them are differentiated at once.
+on the left backwards; states are kept on two levels.
 
-A step from ``Y = I`` with the stages ``k_s = A_s Y_s``, ``Y_s = I + h sum_j a_sj k_j`` returns ``I + h sum_s b_s k_s``. The
-adjoints of a weight W on the result are ``k'_s = h (b_s W + sum_{j > s} a_js Y'_j)`` and ``Y'_s = A_s^T k'_s``, and the
-gradient by ``A_s`` is ``k'_s Y_s^T``.
+A panel is ``P = P0 + B M^(-1) R``. With the unknowns ``X = M^(-1) R`` of unit states, the multipliers ``L = (B M^(-1))^T W``
+and the stage values ``V_t`` that the coefficients ``E_t`` multiply, ``dP = B M^(-1) sum_t dE_t V_t``: the gradient of
+``sum(W * P)`` by ``E_t`` at a node is ``L V_t^T`` there. Gauss schemes are self-adjoint, so L is the same scheme's solution
+of the adjoint equation.
 """
 
 from __future__ import annotations
@@ -20,188 +21,91 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax.analysis.floquet.propagator import Entries, Rows, advanced, explicit_march, identity, slopes_at
-from drivetrain_jax.analysis.numerics import dop853
-from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, stored, suits_one_kernel
-from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lanes_last
+from drivetrain_jax.analysis.floquet.propagator import Panels
+from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last
 from drivetrain_jax.analysis.numerics.linear_algebra import matmul
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
-# Steps differentiated at once, states kept on each of two levels (1 million steps in all), and lanes per block.
-_STEPS, _KEPT, _LANES = 8, 360, 32
+# States kept on each of two levels, 130,000 panels in all, and lanes per block.
+_KEPT, _LANES = 360, 32
 
 Build = Callable[[Any], FloquetModel]
 
 
-class Part(eqx.Module):
-    """A system between two of its breakpoints.
+def direct_form(build: Build, parameters: Any, constants: Constants) -> LinearPeriodic:
+    """The marched form of the system with these ``parameters`` (arrays) and ``constants`` (all else)."""
+    return build(eqx.combine(parameters, constants.tree)).direct
 
-    The unit of time is the span of the part, so that derivatives include the motion of its ends.
+
+def propagators(build: Build, parameters: Any, constants: Constants, count: Array) -> Array:
+    """The propagators of one point between its breakpoints, in ``count`` panels each, ``(parts, n, n)``."""
+    return lanes_last(_marched, Constants((build, constants)), parameters, count, _LANES)
+
+
+def _marched(fixed: Constants, parameters: Any, count: Array) -> Array:
+    build, constants = fixed.tree
+    form = direct_form(build, parameters, constants)
+    lanes = max((x.shape[-1] for x in jax.tree.leaves(parameters) if x.ndim), default=1)
+    unit = jnp.broadcast_to(jnp.eye(form.size)[..., None], (form.size, form.size, lanes))
+
+    def through(part: LinearPeriodic) -> Array:
+        panels = Panels(part)
+        return jax.lax.fori_loop(0, count, lambda k, y: matmul(panels.propagator(panels.fixed, count, k), y), unit)
+
+    return jnp.stack([through(part) for part in form.parts])
+
+
+def weighted_gradient(
+    build: Build, parameters: Any, constants: Constants, number: int, before: Array, weights: Array, count: Array
+) -> Any:
+    """The gradient ``(F,)`` of ``sum(weights * (Phi before))`` by each parameter, in ``count`` panels.
+
+    Phi is the propagator of the part ``number`` between breakpoints; ``before`` is ``(n, n)`` and ``weights`` ``(F, n, n)``.
     """
-
-    parameters: Any
-    build: Build = eqx.field(static=True)
-    constants: Constants = eqx.field(static=True)
-    number: int = eqx.field(static=True)
-
-    def rows(self, s: Any) -> tuple[tuple[Any, ...], ...]:
-        """``A`` times the span, at the fraction s of the span."""
-        form = reduced_form(self.build, self.parameters, self.constants).parts[self.number]
-        entries = form.entries(*form.basis(s * form.span))
-        states = range(form.size)
-        return tuple(tuple(form.span * entries[i, j] if (i, j) in entries else 0 for j in states) for i in states)
-
-    @property
-    def system(self) -> LinearPeriodic:
-        """The part as a system of span 1."""
-        return LinearPeriodic(self.rows, 1.0)
+    fixed = Constants((build, constants, number))
+    return lanes_last(_pulled, fixed, (parameters, before, weights), count, _LANES)
 
 
-def reduced_form(build: Build, parameters: Any, constants: Constants) -> LinearPeriodic:
-    """The reduced form of the system with these ``parameters`` (arrays) and ``constants`` (all else)."""
-    return build(eqx.combine(parameters, constants.tree)).reduced
-
-
-def weighted_gradient(part: Part, before: Array, weights: Array, steps: Array) -> Any:
-    """The gradient ``(F,)`` of ``sum(weights * (Phi before))`` by each parameter of one ``part``, in ``steps`` steps.
-
-    Phi is the propagator of the part; ``before`` is ``(n, n)`` and ``weights`` ``(F, n, n)``.
-    """
-    fixed = Constants((part.build, part.constants, part.number))
-    return lanes_last(_pulled, fixed, (part.parameters, before, weights), steps, _LANES)
-
-
-def _pulled(fixed: Constants, given: tuple[Any, Array, Array], steps: Array) -> Any:
+def _pulled(fixed: Constants, given: tuple[Any, Array, Array], count: Array) -> Any:
     """The :func:`weighted_gradient` of all lanes, which are the last axis of each array."""
     parameters, before, weights = given
     lanes = max(x.shape[-1] for x in jax.tree.leaves(given) if x.ndim)
     parameters = jax.tree.map(lambda x: jnp.broadcast_to(x, lanes), parameters)
     before, weights = (jnp.broadcast_to(x, (*x.shape[:-1], lanes)) for x in (before, weights))
     build, constants, number = fixed.tree
-    part = partial(Part, build=build, constants=constants, number=number)
-    system = part(parameters).system
-    blocks = -(-steps // _STEPS)
-    long = -(-blocks // _KEPT)
-    short = -(-blocks // long)
-    h = 1 / (long * short * _STEPS)
+    long = -(-count // _KEPT)
+    short = -(-count // long)
+    count = long * short
 
-    def interval(number: Array, carry: tuple[Array, Any, Array]) -> tuple[Array, Any, Array]:
-        """First the states before the long intervals; then, for each of these from the last, before its blocks."""
+    def panel(k: Array, parameters: Any) -> Array:
+        panels = Panels(direct_form(build, parameters, constants).parts[number])
+        return panels.propagator(panels.fixed, count, k)
+
+    def onward(start: Array, length: Array, y: Array) -> Array:
+        return jax.lax.fori_loop(start, start + length, lambda k, y: matmul(panel(k, parameters), y), y)
+
+    def interval(step: Array, carry: tuple[Array, Any, Array]) -> tuple[Array, Any, Array]:
+        """First the states before the long intervals; then, for each of these from the last, before its panels."""
         kept, gradient, weights = carry
-        first = number == 0
-        level, k = jnp.where(first, 0, 1), jnp.where(first, 0, long - number)
-        count, length = jnp.where(first, long, short), jnp.where(first, short * _STEPS, _STEPS)
-        start = k * (short * _STEPS * h)
+        first = step == 0
+        level, k = jnp.where(first, 0, 1), jnp.where(first, 0, long - step)
+        number, length = jnp.where(first, long, short), jnp.where(first, short, 1)
 
-        def onward(i: Array, kept: Array) -> Array:
-            t = start + i * (length * h)
-            return kept.at[level, i + 1].set(
-                matmul(explicit_march(system, t, t + length * h, length)[0], kept[level, i])
-            )
+        def forwards(i: Array, kept: Array) -> Array:
+            return kept.at[level, i + 1].set(onward(k * short + i * length, length, kept[level, i]))
 
         def back(j: Array, carry: tuple[Any, Array]) -> tuple[Any, Array]:
-            block = short - 1 - j
-            t = start + block * (_STEPS * h)
-            more, weights = _pulled_block(part, parameters, t, h, kept[1, block], carry[1])
-            return jax.tree.map(jnp.add, carry[0], more), weights
+            i = short - 1 - j
+            matrix, pull = jax.vjp(partial(panel, k * short + i), parameters)
+            own = jnp.sum(carry[1][:, :, None] * kept[1, i][None, None], axis=3)
+            (more,) = jax.vmap(pull)(own)
+            earlier = jax.vmap(matmul, (None, 0))(jnp.swapaxes(matrix, 0, 1), carry[1])
+            return jax.tree.map(jnp.add, carry[0], more), earlier
 
-        kept = jax.lax.fori_loop(0, count - 1, onward, kept.at[level, 0].set(kept[0, k]))
+        kept = jax.lax.fori_loop(0, number - 1, forwards, kept.at[level, 0].set(kept[0, k]))
         gradient, weights = jax.lax.fori_loop(0, jnp.where(first, 0, short), back, (gradient, weights))
         return kept, gradient, weights
 
     kept = jnp.zeros((2, _KEPT, *before.shape)).at[0, 0].set(before)
     none = jax.tree.map(lambda x: jnp.zeros((len(weights), *x.shape)), parameters)
     return jax.lax.fori_loop(0, long + 1, interval, (kept, none, weights))[1]
-
-
-def _pulled_block(
-    part: Callable[[Any], Part], parameters: Any, start: Array, h: Array, state: Array, weights: Array
-) -> tuple[Any, Array]:
-    """Gradients over ``_STEPS`` steps, each step on its own, and the weights pulled back to their start."""
-    n, lanes = state.shape[-2:]
-    starts = jnp.repeat(start + h * jnp.arange(_STEPS), lanes)
-    spread = jax.tree.map(lambda x: jnp.tile(x, _STEPS), parameters)
-
-    def propagators(own: tuple[Any, Array], _: int) -> Array:
-        return explicit_march(part(own[0]).system, own[1], own[1] + h, 1)[0]
-
-    def gradients(own: tuple[Any, Array, Array], _: int) -> Any:
-        return _step_gradient(lambda values: part(values).system, *own[:2], h, own[2])
-
-    def folded(x: Array) -> Array:
-        return x.reshape(*x.shape[:-1], _STEPS, lanes)
-
-    each = jnp.moveaxis(folded(in_blocks(propagators, (spread, starts), len(starts), _LANES)), 2, 0)
-    _, states = jax.lax.scan(lambda y, p: (matmul(p, y), y), state, each)
-
-    def back(after: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
-        p, before = step
-        own = jnp.sum(after[:, :, None] * before[None, None], axis=3)
-        return jax.vmap(matmul, (None, 0))(jnp.swapaxes(p, 0, 1), after), own
-
-    weights, own = jax.lax.scan(back, weights, (each, states), reverse=True)
-    own = jnp.moveaxis(own, 0, 3).reshape(len(weights), n, n, -1)
-    found = jax.lax.map(lambda x: in_blocks(gradients, (spread, starts, x), len(starts), _LANES), own)
-    return jax.tree.map(lambda x: jnp.sum(folded(x), axis=1), found), weights
-
-
-def _step_gradient(
-    system: Callable[[Any], LinearPeriodic], parameters: Any, starts: Array, h: Array, weights: Array
-) -> Any:
-    """The gradient ``(lanes,)`` of ``sum(weights * P)`` by each of ``parameters`` ``(lanes,)``.
-
-    P is the propagator of the step of length ``h`` from each of ``starts`` ``(lanes,)``; ``weights`` are ``(n, n, lanes)``.
-    """
-
-    def gradient(parameters: Any, starts: Array, h: Array, weights: Rows) -> Any:
-        times = starts + h * jnp.asarray(dop853.C)[:, None]
-
-        def entries(values: Any) -> Entries:
-            form = system(values)
-            return {place: jnp.broadcast_to(x, times.shape) for place, x in form.entries(*form.basis(times)).items()}
-
-        spread = jax.tree.map(lambda x: jnp.broadcast_to(x, times.shape), parameters)
-        at_stages, pull = jax.vjp(entries, spread)
-        (found,) = pull(_by_entries(at_stages, h, weights))
-        return jax.tree.map(lambda x: sum(x[k] for k in range(dop853.STAGES)), found)
-
-    given = parameters, starts, h, list(weights)
-    return in_one_kernel(gradient)(*given) if suits_one_kernel(gradient, *given) else gradient(*given)
-
-
-def _by_entries(at_stages: Entries, h: Array, weights: Rows) -> Entries:
-    """The gradient by the entries of ``A`` at all stages, ``(stages, lanes)`` each."""
-    n, lanes = weights[0].shape
-    start, states, slopes = identity(n, lanes), [], []
-    for stage, row in enumerate(dop853.A):
-        states.append(advanced(start, h, row[:stage], slopes))
-        slopes.append(stored(partial(slopes_at, stage))(at_stages, states[-1]))
-    adjoints: list[Rows] = [[]] * dop853.STAGES
-    found: dict[tuple[int, int], list[Array]] = {place: [] for place in at_stages}
-    for stage in reversed(range(dop853.STAGES)):
-        later = [k for k in range(stage + 1, dop853.STAGES) if dop853.A[k][stage]]
-        factors = [dop853.B[stage], *(dop853.A[k][stage] for k in later)]
-        total = stored(partial(_combined, factors))(h, weights, *(adjoints[k] for k in later))
-        own = {place: entry[stage] for place, entry in at_stages.items()}
-        adjoints[stage] = stored(_transposed)(own, total)
-        for (i, j), rows in found.items():
-            rows.insert(0, stored(_inner)(total[i], states[stage][j]))
-    return {place: jnp.concatenate(rows) for place, rows in found.items()}
-
-
-def _combined(factors: list[float], h: Array, *used: Rows) -> Rows:
-    """``h sum(factors * used)``."""
-    return [h * sum(float(f) * rows[i] for f, rows in zip(factors, used, strict=True)) for i in range(len(used[0]))]
-
-
-def _transposed(entries: Entries, rows: Rows) -> Rows:
-    """``A^T rows``."""
-    found: Rows = [0] * len(rows)  # pyright: ignore[reportAssignmentType]
-    for (i, j), entry in entries.items():
-        found[j] = found[j] + entry * rows[i]
-    return found
-
-
-def _inner(x: Array, y: Array) -> Array:
-    product = x * y
-    return sum(product[k : k + 1] for k in range(len(x)))  # pyright: ignore[reportReturnType]

@@ -1,8 +1,8 @@
 """Floquet analysis of a linear periodic system: multipliers, spectral radius with error bound, and verdict of one point.
 
-``direct`` integrates the system's reduced form by diffrax with solvers for linear periodic terms: an explicit scheme of
-order 8, or an L-stable implicit scheme where it needs fewer operations. ``atlas`` evaluates a whole scene from polynomials
-compared with direct solves (see ``drivetrain_jax.atlas``), and solves points in gaps. ``auto`` chooses the cheaper method.
+``direct`` integrates a form of the system by diffrax with a solver for linear periodic terms, Gauss collocation of order 10.
+``atlas`` evaluates a whole scene from polynomials compared with direct solves (see ``drivetrain_jax.atlas``), and solves
+points in gaps. ``auto`` chooses the cheaper method.
 ``diffrax`` uses one of diffrax's own solvers: in equal steps for the reduced form, or in adaptive steps for the system as
 published over its full period (``form = "published"``), with other coordinates, clock and factorisation.
 """
@@ -21,7 +21,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter
 from drivetrain_jax.analysis._base import DIFFRAX_SOLVERS, RTOL, Analysis, Request, Solver
 from drivetrain_jax.analysis.floquet.direct_solvers import direct_solvers
-from drivetrain_jax.analysis.floquet.effort import traced_steps
+from drivetrain_jax.analysis.floquet.effort import traced_panels
 from drivetrain_jax.analysis.floquet.results import VARIABLES, lacks, results
 from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.systems import System
@@ -35,9 +35,9 @@ def _direct_solvers(system: type[System], request: Request) -> tuple[Solver, ...
         system,
         rtol,
         rtol / 4,
-        lambda model: model.reduced,
+        lambda model: model.direct,
         lambda model, z: results(z, request.outputs, rtol, model),
-        stiff=lambda model: model.stiff or model.reduced,
+        damped=True,
     )
 
 
@@ -50,7 +50,7 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     return diffrax_solvers(system, request)
 
 
-# Target of the predicted steps of derivatives, tight because derivatives lose some digits against multipliers.
+# Target of the predicted panels of derivatives, tight because derivatives lose some digits against multipliers.
 _DERIVATIVES = 1e-11
 
 
@@ -77,8 +77,8 @@ def _derivatives(
     from drivetrain_jax.analysis.floquet.derivatives import monodromy, multipliers, shares_modulus
 
     parameters, build = _once(parameters), system.models["floquet"].build
-    steps = traced_steps(build, eqx.combine(parameters, constants.tree), _DERIVATIVES)
-    z, log_scale, pull = monodromy(build, parameters, constants, steps)
+    panels = traced_panels(build, eqx.combine(parameters, constants.tree), _DERIVATIVES)
+    z, log_scale, pull = monodromy(build, parameters, constants, panels)
     sigma, by_entry, error = multipliers(z)
     scale, n = jnp.exp(log_scale), len(sigma)
     unit = sigma / jnp.abs(sigma)
@@ -118,7 +118,7 @@ ANALYSIS = Analysis(
     method_titles={
         "auto": "atlas where that is cheaper, else direct",
         "atlas": "Chebyshev panels compared with direct solves, with their bound",
-        "direct": "equal steps of order 8, implicit where that is cheaper",
+        "direct": "Gauss collocation of order 10 in equal panels",
         "diffrax": "equal steps of a solver of diffrax, or adaptive ones for the equations as published",
     },
     options=(

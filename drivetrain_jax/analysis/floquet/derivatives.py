@@ -1,4 +1,4 @@
-"""Derivatives of Floquet multipliers by the parameters of a system, by the adjoint of the explicit scheme.
+"""Derivatives of Floquet multipliers by the parameters of a system, by the adjoint of the collocation.
 
 A simple multiplier s of ``Z`` moves by ``ds = tr(B dZ) / p'(s)``, where ``p(s) = det(s I - Z)`` and B is the adjugate of
 ``s I - Z``. The gradient of ``sum(W * Z)`` for given weights W costs about as much for many parameters as for one
@@ -14,16 +14,15 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax.analysis.floquet.adjoint import Build, Part, reduced_form, weighted_gradient
+from drivetrain_jax.analysis.floquet.adjoint import Build, direct_form, propagators, weighted_gradient
 from drivetrain_jax.analysis.floquet.direct import assemble
 from drivetrain_jax.analysis.floquet.multipliers import sort_multipliers
-from drivetrain_jax.analysis.floquet.propagator import through
 from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
 
 # Relative difference below which two moduli are equal up to rounding, as all moduli are without damping.
 TIED = 1e-11
-# Relative error of Z with the steps predicted for 1e-11: the largest at 600 random cardan shafts was 2.5e-12.
+# Relative error of Z with the panels predicted for 1e-11: the largest at 600 random cardan shafts was 2.5e-12.
 _MATRIX_ERROR = 3e-12
 # Below this |p'(s)|, in units of the spectral radius, a multiplier s does not count as simple.
 _SIMPLE = 1e-7
@@ -52,34 +51,34 @@ class Multipliers(NamedTuple):
     error: Array
 
 
-def monodromy(build: Build, parameters: Any, constants: Constants, steps: Array) -> DifferentiableMonodromy:
-    """The monodromy matrix of one point in ``steps`` steps, differentiable by ``parameters``, a pytree of P numbers."""
-    form = reduced_form(build, parameters, constants)
-    parts = [Part(parameters, build, constants, number) for number in range(len(form.breakpoints) + 1)]
-    found = [through([part.system], steps) for part in parts]
-    phis, log_scale = [each.matrix for each in found], jnp.sum(jnp.stack([each.log_scale for each in found]))
+def monodromy(build: Build, parameters: Any, constants: Constants, panels: Array) -> DifferentiableMonodromy:
+    """The monodromy matrix of one point in ``panels`` panels, differentiable by ``parameters``, a pytree of P numbers."""
+    parts = propagators(build, parameters, constants, panels)
+    # Products that would overflow are scaled: only ratios of entries matter for the direction of a derivative.
+    phi = parts[0]
+    for later in parts[1:]:
+        phi = later @ phi
+    size = jnp.max(jnp.abs(phi))
 
     def z(parameters: Any, phi: Array) -> Array:
-        return assemble(reduced_form(build, parameters, constants), phi)
+        return assemble(direct_form(build, parameters, constants).ends(), phi)
 
-    phi = phis[0]
-    for later in phis[1:]:
-        phi = later @ phi
-    value, pull_back = jax.vjp(z, parameters, phi)
+    value, pull_back = jax.vjp(z, parameters, phi / size)
+    halves = direct_form(build, parameters, constants).halves
 
     def pull(weights: Array) -> Array:
         gradient, weights = jax.vmap(pull_back)(weights)
+        weights = weights / size
         for number in reversed(range(len(parts))):
             before = jnp.eye(len(phi))
-            for earlier in phis[:number]:
+            for earlier in parts[:number]:
                 before = earlier @ before
-            scaled = weights * jnp.exp(-found[number].log_scale)
-            own = weighted_gradient(parts[number], before, scaled, steps)
+            own = weighted_gradient(build, parameters, constants, number, before, weights, panels)
             gradient = jax.tree.map(jnp.add, gradient, own)
-            weights = phis[number].T @ weights
+            weights = parts[number].T @ weights
         return jnp.stack(jax.tree.leaves(gradient), axis=1)
 
-    return DifferentiableMonodromy(value, form.halves * log_scale, pull)
+    return DifferentiableMonodromy(value, halves * jnp.log(size), pull)
 
 
 def multipliers(z: Array) -> Multipliers:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import reduce
 from typing import Any
 
@@ -14,9 +14,9 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis._base import Outcome, Request, Solver
-from drivetrain_jax.analysis.floquet.direct import compare, direct_monodromy, stable_steps, stiffness_of
-from drivetrain_jax.analysis.floquet.effort import explicit_effort, traced_steps
-from drivetrain_jax.analysis.floquet.propagator import EqualStepSize, LinearTerm, Propagator
+from drivetrain_jax.analysis.floquet.direct import Monodromy, Propagator, compare, stiffness_of, unknown
+from drivetrain_jax.analysis.floquet.effort import stable_steps, steps_needed, traced_steps
+from drivetrain_jax.analysis.floquet.propagator import EqualStepSize, LinearTerm
 from drivetrain_jax.analysis.floquet.results import NEED_ERROR, results
 from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last, over_lanes
 from drivetrain_jax.systems import LinearPeriodic, System
@@ -24,6 +24,8 @@ from drivetrain_jax.systems import LinearPeriodic, System
 # Most steps over the span; usual points take up to 1e4. With equal steps, points that are predicted to need more are not
 # begun, and no refinement has more.
 MAX_STEPS = 200_000
+# Most doublings of the steps.
+_MAX_REFINEMENTS = 6
 # Cancels the safety factor of `compare`: the error is the plain difference between two tolerances a decade apart.
 _REDUCTION = 4.0
 # Ratio of rtol to the target of the matrix: the bound of a spectral radius is up to a hundred times the bound of its
@@ -51,21 +53,20 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
         shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in values.values() if not isinstance(x, str)))
         order = solver.order(model.reduced)
 
-        def propagate(steps: Array, _: Array) -> Propagator:
+        def propagate(steps: Array) -> Propagator:
             def one(own: Mapping[str, Any], steps: Array) -> Propagator:
                 return equal_step_propagator(build(own).reduced, solver, steps)
 
             return over_lanes(one)(values, steps)
 
-        stiffness, least = stiffness_of(model.reduced, shape), stable_steps(model.reduced)
-        target = rtol / _MARGIN
-        z = direct_monodromy(model.reduced, propagate, steps, shape, stiffness, target, order, 2, least, most=MAX_STEPS)
+        steps = jnp.maximum(steps, jnp.ceil(stable_steps(model.reduced)).astype(steps.dtype))
+        z = _refined(model.reduced, propagate, jnp.minimum(steps, MAX_STEPS), shape, rtol / _MARGIN, order)
         return results(z, request.outputs, rtol, model)
 
     def effort(columns: Mapping[str, Any]) -> np.ndarray:
         # Fitted for order 8; a lower order needs more steps for a smaller tolerance.
         more = rtol ** (1 / 8 - 1 / solver.order(diffrax.ODETerm(lambda t, y, args: y)))
-        found = more * explicit_effort(system, columns, rtol)
+        found = more * steps_needed(system, columns, rtol)
         return np.where(found <= MAX_STEPS, found, np.inf)
 
     def steps(values: Mapping[str, Any]) -> Array:
@@ -74,6 +75,44 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
         return jnp.minimum(found, MAX_STEPS).astype(jnp.int64)
 
     return (Solver(f"diffrax: {request.options['solver']}, equal steps", solve, effort, steps, chunk=256, march=True),)
+
+
+def _refined(
+    form: LinearPeriodic,
+    propagate: Callable[[Array], Propagator],
+    steps: Array,
+    shape: tuple[int, ...],
+    target: float,
+    order: int,
+) -> Monodromy:
+    """The monodromy matrix, with ``steps`` and twice as many steps until all lanes of two counts agree to ``target``.
+
+    A lane that overflows has two doublings to recover and then no longer delays the others.
+    """
+    ends, determinant = form.ends(), form.log_determinant and form.log_determinant()
+    stiffness = stiffness_of(form, shape)
+    propagate = jax.jit(propagate)  # traced once, not for its shapes and again for its values
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(propagate, steps))
+    nothing = jax.tree.map(
+        lambda x: jnp.broadcast_to(x.reshape(*x.shape, *(1,) * len(shape)), (*x.shape, *shape)), unknown(form.size)
+    )
+
+    def unfinished(state: tuple) -> Array:
+        count, current, _, found = state
+        finite = jnp.all(jnp.isfinite(found.matrix), axis=(0, 1))
+        lagging = jnp.where(finite, count < 2 + _MAX_REFINEMENTS, count < 4) & ~found.met
+        return (count < 2) | ((current <= MAX_STEPS) & jnp.any(lagging))
+
+    def refine(state: tuple) -> tuple:
+        count, current, coarse, _ = state
+        fine = propagate(current)._replace(stiffness=stiffness)
+        found = jax.lax.cond(
+            count > 0, lambda: compare(ends, determinant, coarse, fine, current, 2.0**order, target), lambda: nothing
+        )
+        return count + 1, 2 * current, fine, found
+
+    start = (jnp.int32(0), jnp.maximum(-(-steps // 2), 1), blank._replace(stiffness=stiffness), nothing)
+    return jax.lax.while_loop(unfinished, refine, start)[-1]
 
 
 def adaptive_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
@@ -93,7 +132,8 @@ def adaptive_steps(system: type[System], request: Request) -> tuple[Solver, ...]
 
         fine, success = propagate(rtol / 10)
         coarse, success_coarse = propagate(rtol) if needs_error else (fine, success)
-        z = compare(form, coarse, fine, jnp.zeros(()), 0.0, rtol, _REDUCTION)
+        determinant = form.log_determinant and form.log_determinant()
+        z = compare(form.ends(), determinant, coarse, fine, jnp.zeros(()), 1 + _REDUCTION, rtol)
         found = results(z, request.outputs, rtol, model)
         failed = ~(success & success_coarse)
         lost = jnp.where(has_finite_entries(form), jnp.int8(Outcome.STEP_LIMIT), jnp.int8(Outcome.NOT_FINITE))
@@ -102,7 +142,7 @@ def adaptive_steps(system: type[System], request: Request) -> tuple[Solver, ...]
     def effort(columns: Mapping[str, Any]) -> np.ndarray:
         # Infinite where equal steps of order 8 would be five times ``MAX_STEPS``: no explicit solver gets there. An implicit
         # one may.
-        found = explicit_effort(system, columns, rtol)
+        found = steps_needed(system, columns, rtol)
         return np.nan_to_num(found) if issubclass(type(solver), diffrax.AbstractImplicitSolver) else found
 
     name = f"diffrax: {request.options['solver']}, {request.options['form']}, adaptive steps"
@@ -116,7 +156,8 @@ def equal_step_propagator(form: LinearPeriodic, solver: diffrax.AbstractSolver, 
     """
     matrices = [_of_part(part, solver, steps) for part in form.parts]
     matrix = reduce(lambda before, after: after @ before, matrices)
-    return Propagator(matrix, jnp.zeros(()), jnp.ones(()))
+    zero = jnp.zeros(())
+    return Propagator(matrix, zero, jnp.ones(()), zero, zero, zero, zero - jnp.inf)
 
 
 def _of_part(form: LinearPeriodic, solver: diffrax.AbstractSolver, steps: Array) -> Array:
@@ -178,4 +219,4 @@ def diffrax_propagator(
         )
         success &= solution.result == diffrax.RESULTS.successful
         matrix = solution.ys[-1]  # pyright: ignore[reportOptionalSubscript]
-    return Propagator(jnp.where(success, matrix, jnp.nan), jnp.zeros(()), jnp.ones(())), success
+    return Propagator(jnp.where(success, matrix, jnp.nan), jnp.zeros(())), success

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
@@ -54,8 +55,9 @@ def characteristic_coefficients(z: Array) -> Array:
 def root_scale(coefficients: Array) -> Array:
     """Lower bound of the largest modulus of the roots: max_k (|a_k| / binomial(n, k))^(1/k), ``(n, ...) -> (...)``."""
     n = coefficients.shape[0]
-    terms = [(jnp.abs(coefficients[k - 1]) / math.comb(n, k)) ** (1 / k) for k in range(1, n + 1)]
-    return jnp.max(jnp.stack(terms), axis=0)
+    roots = {1: lambda x: x, 2: jnp.sqrt, 3: jnp.cbrt, 4: lambda x: jnp.sqrt(jnp.sqrt(x))}
+    terms = [jnp.abs(coefficients[k - 1]) / math.comb(n, k) for k in range(1, n + 1)]
+    return reduce(jnp.maximum, (roots.get(k, lambda x, k=k: x ** (1 / k))(x) for k, x in enumerate(terms, 1)))
 
 
 def sort_multipliers(real: Array, imaginary: Array) -> Array:

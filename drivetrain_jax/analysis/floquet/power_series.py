@@ -20,8 +20,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis.numerics.collocation import radau
 from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, suits_one_kernel
-from drivetrain_jax.analysis.numerics.radau import radau_iia
 from drivetrain_jax.systems import LinearPeriodic
 
 # Nodes of a part and powers of x: both have about the same truncation error.
@@ -38,7 +38,7 @@ def propagators_along(form: Form, ends: Array, first: int, lanes: int, parts: Ar
     size of the last term relative to the largest term, in the worst part, and infinite if ``A0`` has entries that do not
     lead from the ``first`` states to the others.
     """
-    weights, places = radau_iia(NODES)
+    weights, _, places = radau(NODES)
     system = form(ends[0])
     if system.breakpoints:
         raise InputError(f"breakpoints: got {len(system.breakpoints)}; allowed with Series is none")

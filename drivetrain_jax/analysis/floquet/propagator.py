@@ -1,17 +1,16 @@
-"""Propagators of linear periodic systems by diffrax, with two solvers of equal steps: explicit of order 8, or L-stable.
+"""Propagators of linear periodic systems by Gauss collocation, as a solver of diffrax whose single step is the whole span.
 
-Both return ``Phi`` over ``[0, span]`` of a :class:`~drivetrain_jax.systems.LinearPeriodic` with the number of steps as a
-traced integer, so that one compilation serves every accuracy. A step of diffrax is a piece of the span, and a piece is many
-steps of the scheme. Under ``jax.vmap`` the explicit scheme marches each block of lanes as one kernel and keeps every matrix
-as rows of shape ``(n, lanes)``. The entries of ``A`` at all stages of a step are evaluated together, so that common
-expressions are computed once (:mod:`~drivetrain_jax.analysis.numerics.staged`).
+A system ``q' = p, p' = P q + E p`` is marched in its second derivatives, any other system in its slopes
+(:mod:`~drivetrain_jax.analysis.numerics.collocation`). A step marches a coarse and a fine number of panels, compares the
+monodromy matrices and doubles the panels until they agree. Under ``jax.vmap`` each block of lanes is one kernel with all of
+this, so that a difficult point repeats only its own block. The number of panels is a traced integer: one compilation serves
+every accuracy. The entries of ``A`` at all nodes of a panel are evaluated together, so that common expressions are computed
+once (:mod:`~drivetrain_jax.analysis.numerics.staged`).
 """
 
 from __future__ import annotations
 
-import abc
-from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
@@ -21,51 +20,30 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.numerics import dop853
-from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, stored, suits_one_kernel
-from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last
-from drivetrain_jax.analysis.numerics.linear_algebra import matmul, solve
-from drivetrain_jax.analysis.numerics.radau import radau_iia
+from drivetrain_jax.analysis.floquet.direct import Monodromy, Propagator, compare, unknown
+from drivetrain_jax.analysis.numerics.collocation import Scheme, first_order, gauss, panel, second_order
+from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, on_cpu, stored, suits_one_kernel
+from drivetrain_jax.analysis.numerics.lanes import Constants, blocks_first, blocks_joined, lanes_last, traced_once
+from drivetrain_jax.analysis.numerics.linear_algebra import largest, matmul, square_sum
 from drivetrain_jax.analysis.numerics.staged import staged
 from drivetrain_jax.systems import LinearPeriodic
 
-
-class Propagator(NamedTuple):
-    """``Phi = exp(log_scale) matrix``, shape ``(n, n, ...)``.
-
-    ``growth`` is the factor by which earlier errors have grown at the end T, against errors made at T: the root mean square
-    of ``|Phi(T, t)| |Phi(t, 0)| / |Phi(T, 0)|`` (1 at t = T) over the ends t of the pieces.
-    """
-
-    matrix: Array
-    log_scale: Array
-    growth: Array
-
-
-# Order of the explicit scheme; stages of the implicit scheme, and its order for stiff problems (the stage order, instead of
-# the classical order 15).
-EXPLICIT_ORDER, STAGES, IMPLICIT_ORDER = 8, 8, 8
-# Lanes per block: the data of a step fit into the innermost caches.
+# Nodes of a panel, and order of the errors.
+STAGES, ORDER = 5, 10
+# Lanes per block: with 8 or 16 the compiler unrolls to scalar code, and the data of 64 leave the innermost cache.
 LANES = 32
-# States whose largest entry is beyond exp(70), or below exp(-70), are scaled: far from overflow, even squared.
-_FAR = 70.0
-# Most pieces of the span; the growth of errors is measured between pieces.
-PIECES = 16
+# Most doublings of the predicted number of panels, and most panels.
+_MAX_REFINEMENTS, MAX_PANELS = 6, 2**19
+# Gauss schemes of s stages turn a decay by exp(-D), if it is fast, into a decay by exp(-2 s (s + 1) n^2/D) in n panels.
+_UNDAMPED = 2.0 * STAGES * (STAGES + 1)
+# Angle of an oscillation in a panel beyond which two numbers of panels may agree by accident.
+_RESOLVED = 4.0
+# Decay over the span beyond which damping is strong.
+_STRONG = 8.0
+# States beyond this size, or below its inverse, are scaled: far from overflow, even squared and after another panel.
+_FAR = 1e60
 
-Rows = list[Array]
 Entries = dict[tuple[int, int], Array]
-_NOTHING = Constants(())
-
-
-class _Record(NamedTuple):
-    """``y(t) = exp(log_scale) state``, and the covariance at t of errors made at the ends of all steps so far.
-
-    Errors are independent, and each is as large as ``y`` at its time. With the propagator P of a step the covariance obeys
-    ``C' = P C P^T + |y|^2 I``.
-    """
-
-    log_scale: Array
-    covariance: Array
 
 
 class LinearTerm(diffrax.AbstractTerm):
@@ -87,98 +65,6 @@ class LinearTerm(diffrax.AbstractTerm):
         return vf * control
 
 
-class EqualSteps(diffrax.AbstractSolver):
-    """A solver of linear periodic terms: each step of diffrax is ``count`` equal steps of its scheme.
-
-    The state is a vector or a matrix of vectors. A state far from 1 is scaled, and the solver's state holds the logarithm
-    of the scale.
-    """
-
-    count: Any
-    ORDER: ClassVar[int]
-    term_structure: ClassVar = LinearTerm
-    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
-
-    def order(self, terms: LinearTerm) -> int:
-        """Order of the errors, for stiff problems too."""
-        return self.ORDER
-
-    def init(self, terms: LinearTerm, t0: Any, t1: Any, y0: Array, args: Any) -> _Record:
-        """The record at the start: no scaling and no errors."""
-        return _Record(jnp.zeros(()), jnp.zeros((len(y0), len(y0))))
-
-    def func(self, terms: LinearTerm, t0: Any, y0: Array, args: Any) -> Array:
-        """``A(t) y``."""
-        return terms.vf(t0, y0, args)
-
-    def step(
-        self, terms: LinearTerm, t0: Any, t1: Any, y0: Array, args: Any, solver_state: _Record, made_jump: Any
-    ) -> tuple[Array, None, dict[str, Array], _Record, diffrax.RESULTS]:
-        """The state at t1."""
-        del args, made_jump
-        system, forwards = _unwrapped(terms)
-        given = (*self.piece(system, forwards * t0, forwards * t1), y0.reshape(len(y0), -1), solver_state)
-        y1, record = lanes_last(_onward, _NOTHING, given, ())
-        y1 = y1.reshape(y0.shape)
-        return y1, None, {"y0": y0, "y1": y1}, record, diffrax.RESULTS.successful
-
-    @abc.abstractmethod
-    def piece(self, system: LinearPeriodic, t0: Any, t1: Any) -> tuple[Array, Array]:
-        """The propagator from t0 to t1 as a matrix ``(n, n)`` and the logarithm of its factor."""
-
-
-def _unwrapped(terms: Any) -> tuple[LinearPeriodic, Any]:
-    """The system of a term that diffrax may have wrapped, and 1, or -1 if it solves backwards."""
-    return (terms.system, 1) if isinstance(terms, LinearTerm) else (terms.term.system, terms.direction)
-
-
-class Order8(EqualSteps):
-    """The 12-stage Runge-Kutta scheme of order 8 (DOP853) in equal steps, for blocks of lanes under ``jax.vmap``."""
-
-    ORDER: ClassVar = EXPLICIT_ORDER
-
-    def piece(self, system: LinearPeriodic, t0: Any, t1: Any) -> tuple[Array, Array]:
-        """See :class:`EqualSteps`."""
-        # The other fields of the system are not used.
-        arrays, rest = eqx.partition(LinearPeriodic(system.rows, 1.0, system.basis), eqx.is_array)
-        shared = jnp.asarray(t0, float), jnp.asarray(t1, float), self.count
-        if not jax.tree.leaves(arrays) or not system.is_pytree:
-            # No arrays to batch, or a function that may depend on unknown arrays.
-            matrix, log_scale = explicit_march(system, *shared)
-            return matrix[..., 0], log_scale[0]
-        return lanes_last(_block, Constants(rest), arrays, shared, LANES)
-
-
-def _block(rest: Constants, arrays: LinearPeriodic, shared: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-    return explicit_march(eqx.combine(arrays, rest.tree), *shared)
-
-
-class Radau(EqualSteps):
-    """Radau IIA collocation with 8 stages (order 15, L-stable) in equal panels."""
-
-    ORDER: ClassVar = IMPLICIT_ORDER
-
-    def piece(self, system: LinearPeriodic, t0: Any, t1: Any) -> tuple[Array, Array]:
-        """See :class:`EqualSteps`. The product is rescaled after each panel, so that strong damping does not underflow.
-
-        The stage values solve ``Y_i - h sum_j a_ij A(t_j) Y_j = I``; the last one is the panel's propagator.
-        """
-        a, c = radau_iia(STAGES)
-        h, n = (t1 - t0) / self.count, system.size
-        right = jnp.tile(jnp.eye(n), (STAGES, 1))
-        at_nodes = jax.vmap(system.matrix)
-
-        def body(step: Array, carry: tuple) -> tuple:
-            product, log_scale = carry
-            blocks = jnp.einsum("ij,jkl->ikjl", h * a, at_nodes(t0 + (step + c) * h)).reshape(STAGES * n, STAGES * n)
-            product = solve(jnp.eye(STAGES * n) - blocks, right)[-n:] @ product
-            size = jnp.max(jnp.abs(product))
-            size = jnp.where(size > 0, size, 1.0)
-            return product / size, log_scale + jnp.log(size)
-
-        return jax.lax.fori_loop(0, self.count, body, (jnp.eye(n), jnp.zeros(())))
-
-
 class EqualStepSize(diffrax.ConstantStepSize):
     """``count`` equal steps, which may be traced."""
 
@@ -189,119 +75,316 @@ class EqualStepSize(diffrax.ConstantStepSize):
         return super().init(terms, t0, t1, y0, (t1 - t0) / self.count, args, func, error_order)
 
 
-def propagator(
-    system: LinearPeriodic, steps: Array, pieces: Array | int = 1, solver: type[EqualSteps] = Order8
-) -> Propagator:
-    """``Phi`` of one point by ``steps`` equal steps (or panels) of ``solver``, a multiple of ``pieces``.
+class Gauss(diffrax.AbstractSolver):
+    """Gauss collocation of order 10 for a :class:`LinearTerm`, in one step over the span of its system.
 
-    The growth of errors is measured between the ``pieces`` of the span, at most ``PIECES``. Between two breakpoints there
-    are as many steps as in a span without any.
+    The step takes ``panels / ratio`` and ``panels`` panels, then twice as many, until the monodromy matrices of two numbers
+    of panels agree to ``rtol``. The state is the matrix of the propagator, or vectors. The solver's state is the
+    :class:`~drivetrain_jax.analysis.floquet.direct.Monodromy` matrix with its error.
     """
-    return through(system.parts, steps, pieces, solver)
 
+    panels: Any
+    rtol: Any
+    ratio: Any = 2
+    term_structure: ClassVar = LinearTerm
+    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
-def through(
-    parts: Sequence[LinearPeriodic], steps: Array, pieces: Array | int = 1, solver: type[EqualSteps] = Order8
-) -> Propagator:
-    """The :func:`propagator` over the spans of ``parts`` one after another, in ``steps`` steps each."""
-    matrix, record = jnp.eye(parts[0].size), None
-    for part in parts:
-        end = diffrax.diffeqsolve(
-            LinearTerm(part),
-            solver(steps // pieces),
-            t0=0.0,
-            t1=part.span,
-            dt0=None,
-            y0=matrix,
-            stepsize_controller=EqualStepSize(pieces),
-            saveat=diffrax.SaveAt(t1=True, solver_state=True),
-            adjoint=diffrax.ForwardMode(),
-            max_steps=PIECES,
-            throw=False,
-            solver_state=record,
+    def order(self, terms: LinearTerm) -> int:
+        """Order of the errors."""
+        return ORDER
+
+    def init(self, terms: LinearTerm, t0: Any, t1: Any, y0: Array, args: Any) -> Monodromy:
+        """No matrix yet."""
+        return unknown(len(y0))
+
+    def func(self, terms: LinearTerm, t0: Any, y0: Array, args: Any) -> Array:
+        """``A(t) y``."""
+        return terms.vf(t0, y0, args)
+
+    def step(
+        self, terms: LinearTerm, t0: Any, t1: Any, y0: Array, args: Any, solver_state: Monodromy, made_jump: Any
+    ) -> tuple[Array, None, dict[str, Array], Monodromy, diffrax.RESULTS]:
+        """The state at the end of the span."""
+        del t0, t1, args, solver_state, made_jump
+        system = terms.system if isinstance(terms, LinearTerm) else terms.term.system
+        propagator, monodromy = self.solved(system)
+        y1 = matmul(propagator, y0.reshape(len(y0), -1)).reshape(y0.shape)
+        return y1, None, {"y0": y0, "y1": y1}, monodromy, diffrax.RESULTS.successful
+
+    def solved(self, system: LinearPeriodic) -> tuple[Array, Monodromy]:
+        """The propagator over the span, and the monodromy matrix."""
+        arrays, rest = eqx.partition(system, eqx.is_array)
+        fixed, shared = (
+            Constants(rest),
+            (jnp.asarray(self.panels), jnp.asarray(self.rtol, float), jnp.asarray(self.ratio)),
         )
-        matrix, record = end.ys[0], end.solver_state  # pyright: ignore[reportOptionalSubscript]
-    count = len(matrix) * len(parts) * pieces
-    growth = jnp.sqrt(jnp.trace(record.covariance) / (count * jnp.sum(matrix**2)))  # pyright: ignore[reportOptionalMemberAccess]
-    return Propagator(matrix, record.log_scale, growth)  # pyright: ignore[reportOptionalMemberAccess]
+        if not jax.tree.leaves(arrays) or not system.is_pytree:
+            # No arrays to batch, or a function that may depend on unknown arrays.
+            return jax.tree.map(lambda x: x[..., 0], _refined(fixed, arrays, shared))
+        return lanes_last(partial(traced_once, _refined), fixed, arrays, shared)
 
 
-def _onward(_: Constants, varying: tuple[Array, Array, Array, _Record], __: tuple) -> tuple[Array, _Record]:
-    """State and record after a step, all with the lanes as last axis."""
-    matrix, log_scale, state, record = varying
-    state, moved = stored(_moved)(matrix, state, record.covariance)
-    size = jnp.max(jnp.abs(state), axis=(0, 1))
-    total = log_scale + jnp.log(jnp.where(size > 0, size, 1.0))
-    near = jnp.abs(total) <= _FAR
-    factor = jnp.where(near, jnp.exp(log_scale), 1 / jnp.where(size > 0, size, 1.0))
-    state = state * factor
-    unit = jnp.eye(len(matrix)).reshape(*matrix.shape[:2], *(1,) * (matrix.ndim - 2))
-    covariance = moved * factor**2 + jnp.sum(state**2, axis=(0, 1)) * unit
-    return state, _Record(record.log_scale + jnp.where(near, 0.0, total), covariance)
+def monodromy(system: LinearPeriodic, panels: Array, rtol: Any, ratio: Any = 2) -> Monodromy:
+    """The monodromy matrix of one point, from ``panels`` predicted panels on."""
+    end = diffrax.diffeqsolve(
+        LinearTerm(system),
+        Gauss(panels, rtol, ratio),
+        t0=0.0,
+        t1=1.0,
+        dt0=None,
+        y0=jnp.eye(system.size),
+        stepsize_controller=EqualStepSize(1),
+        saveat=diffrax.SaveAt(solver_state=True),
+        adjoint=diffrax.ForwardMode(),
+        max_steps=1,
+        throw=False,
+    )
+    return end.solver_state  # pyright: ignore[reportReturnType]
 
 
-def _moved(piece: Array, state: Array, covariance: Array) -> tuple[Array, Array]:
-    return matmul(piece, state), matmul(matmul(piece, covariance), jnp.swapaxes(piece, 0, 1))
+def march(system: LinearPeriodic, count: Array) -> Propagator:
+    """The propagator of one point over the span, in ``count`` panels between two breakpoints."""
+    state = _State.start(system.size, 1)
+    for part in system.parts:
+        panels = Panels(part)
+        state = panels.through(panels.fixed, state, count, jnp.array(True))
+    return jax.tree.map(lambda x: x[..., 0], state.propagator(count * len(system.parts)))
 
 
-def explicit_march(system: LinearPeriodic, t0: Array, t1: Array, count: Array | int) -> tuple[Array, Array]:
-    """``Phi`` from t0 to t1 of all lanes, the last axis of arrays that vary, by ``count`` steps."""
-    varying = jax.tree.leaves((eqx.filter(system, eqx.is_array), t0, t1))
-    lanes = max((np.shape(x)[-1] for x in varying if np.ndim(x)), default=1)
-    times = jnp.zeros((dop853.STAGES, np.size(t0)))
-    split = staged(system.entries, *jax.eval_shape(system.basis, times))
-    suits = suits_one_kernel(lambda t: system.rows(*system.basis(t)), times)
-    mark = in_one_kernel if suits else lambda function: function
+def _refined(fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array, Array, Array]) -> tuple[Array, Monodromy]:
+    """The propagator and the monodromy matrix of all lanes, the last axis of ``arrays``."""
+    lanes = max((x.shape[-1] for x in jax.tree.leaves(arrays) if x.ndim), default=1)
+    size = LANES if lanes > LANES and on_cpu() else lanes
+    blocks = jax.tree.map(lambda x: blocks_first(x, size) if x.ndim and x.shape[-1] == lanes else x, arrays)
+    marches: list[Panels] = []
+    numbers: list[Any] = []
 
-    def march(count: Array | int, start: Array, h: Array, fixed: list[Array]) -> Rows:
-        step = partial(_explicit_step, system.basis, partial(split.moving, fixed), start, h)
-        return jax.lax.fori_loop(0, count, step, identity(system.size, lanes))
+    def prepared(arrays: LinearPeriodic) -> tuple[Any, Any, Any]:
+        """What does not change during the march, for all blocks at once."""
+        system = eqx.combine(arrays, fixed.tree)
+        marches[:] = [Panels(part) for part in system.parts]
+        ends, numbers[:] = _arrays_and_numbers(system.ends())
+        return [march.fixed for march in marches], ends, system.log_determinant and system.log_determinant()
 
-    rows = mark(march)(count, t0, (t1 - t0) / count, split.fixed)
-    return jnp.stack(rows), jnp.zeros(lanes)
+    axes = jax.tree.map(lambda x, cut: 0 if cut.ndim > x.ndim else None, arrays, blocks)
+    leaves, tree = jax.tree.flatten(jax.vmap(prepared, (axes,), axis_size=-(-lanes // size))(blocks))
+    # One array for each shape, because equal inputs of a kernel crash the compiler of jax 0.10.2.
+    kinds = list(dict.fromkeys(x.shape for x in leaves))
+    packed = [jnp.stack([x for x in leaves if x.shape == kind], axis=1) for kind in kinds]
 
+    def all_blocks(shared: tuple[Array, Array, Array], packed: list[Array]) -> tuple[Array, Monodromy]:
+        def block(packed: list[Array]) -> tuple[Array, Monodromy]:
+            rows = {kind: iter(stack) for kind, stack in zip(kinds, packed, strict=True)}
+            values, ends, determinant = jax.tree.unflatten(tree, [next(rows[x.shape]) for x in leaves])
+            return _agreeing(marches, values, eqx.combine(ends, numbers[0]), determinant, size, *shared)
 
-def identity(n: int, lanes: int) -> Rows:
-    """The rows of the unit matrix."""
-    return [jnp.concatenate([jnp.full((1, lanes), float(i == j)) for j in range(n)]) for i in range(n)]
+        return jax.lax.map(block, packed)
 
-
-def _explicit_step(
-    basis: Callable[[Array], tuple[Array, ...]],
-    entries: Callable[..., Entries],
-    start: Array,
-    h: Array,
-    number: Array,
-    y: Rows,
-) -> Rows:
-    """One step from ``start + number * h``: the entries at all stages first, then stage after stage."""
-    at_stages = entries(*basis(start + (number + jnp.asarray(dop853.C)[:, None]) * h))
-    slopes: list[Rows] = []
-    for stage, weights in enumerate(dop853.A):
-        state = advanced(y, h, weights[:stage], slopes)
-        slopes.append(stored(partial(slopes_at, stage))(at_stages, state))
-    return advanced(y, h, dop853.B, slopes)
+    mark = in_one_kernel if all(march.suits for march in marches) else lambda function: function
+    return jax.tree.map(lambda x: blocks_joined(x, lanes), mark(all_blocks)(shared, packed))
 
 
-def slopes_at(stage: int, at_stages: Entries, state: Rows) -> Rows:
-    """``A y`` at one stage."""
-    slopes: Rows = [0] * len(state)  # pyright: ignore[reportAssignmentType]
-    for (i, j), entry in at_stages.items():
-        slopes[i] = slopes[i] + _at(entry, stage) * state[j]
-    return slopes
+def _arrays_and_numbers(rows: Any) -> tuple[Any, list[Any]]:
+    """The arrays among the entries, and the numbers, which stay known while the kernel is traced."""
+    arrays, numbers = eqx.partition(rows, eqx.is_array)
+    return arrays, [numbers]
 
 
-def _at(entry: Array, stage: int) -> Array:
-    return entry[min(stage, entry.shape[0] - 1)] if entry.ndim > 1 else entry
+def _agreeing(
+    marches: list[Panels],
+    fixed: list[Fixed],
+    ends: Any,
+    determinant: Array | None,
+    lanes: int,
+    panels: Array,
+    rtol: Array,
+    ratio: Array,
+) -> tuple[Array, Monodromy]:
+    """The finer of two propagators whose monodromy matrices agree, for one block of ``lanes``."""
+    n = marches[0].size
+
+    def run(count: Array, records: Array) -> Propagator:
+        state = _State.start(n, lanes)
+        for march, own in zip(marches, fixed, strict=True):
+            state = march.through(own, state, count, records)
+        found = state.propagator(count)
+        return found if marches[0].d == n else found._replace(squared=found.decay / _STRONG)
+
+    def unfinished(state: tuple) -> Array:
+        number, count, propagator, found = state
+        going = ~found.met & (jnp.isfinite(propagator.matrix[0, 0]) | (number < 4))
+        return (number < 2) | ((number < 2 + _MAX_REFINEMENTS) & (count <= MAX_PANELS) & _any(going))
+
+    def refine(state: tuple) -> tuple:
+        number, count, coarse, _ = state
+        fine = run(count, number == 0)
+        fine = Propagator(
+            *fine[:2], *(jnp.where(number == 0, *pair) for pair in zip(fine[2:], coarse[2:], strict=True))
+        )
+        missed = (fine.stiffness > _RESOLVED * count) & (fine.decay < fine.stiffness)
+        undamped = jnp.where(fine.decay > 0, -_UNDAMPED * (1.0 * count) ** 2 / fine.decay, -jnp.inf)
+        fine = fine._replace(undamped=jnp.where(missed, jnp.inf, undamped))
+        gain = jnp.where(number == 1, count / first, 2.0) ** ORDER
+        found = jax.lax.cond(
+            number > 0, lambda: compare(ends, determinant, coarse, fine, count, gain, rtol), lambda: none
+        )
+        return number + 1, jnp.where(number == 0, panels, 2 * count), fine, found
+
+    first = jnp.maximum(-(-panels // ratio), 1)
+    start = _State.start(n, lanes).propagator(first)
+    none = jax.tree.map(lambda x: jnp.broadcast_to(x[..., None], (*x.shape, lanes)), unknown(n))
+    _, _, propagator, found = jax.lax.while_loop(unfinished, refine, (jnp.int32(0), first, start, none))
+    return propagator.matrix, found
 
 
-def advanced(y: Rows, h: Array, weights: Any, slopes: list[Rows]) -> Rows:
-    """``y + h sum(weights * slopes)``."""
-    terms = [(float(w), slope) for w, slope in zip(weights, slopes, strict=True) if w != 0]
-    if not terms:
-        return y
+def _any(flags: Array) -> Array:
+    """True if any of ``flags`` ``(lanes,)`` is, by slices: a reduction cannot be part of a kernel."""
+    while len(flags) > 1:
+        half = len(flags) // 2
+        folded = flags[:half] | flags[half : 2 * half]
+        flags = folded if len(flags) % 2 == 0 else jnp.concatenate([folded[:-1], folded[-1:] | flags[-1:]])
+    return flags[0]
 
-    def moved(y: Rows, h: Array, *used: Rows) -> Rows:
-        return [x + h * sum(w * k[i] for (w, _), k in zip(terms, used, strict=True)) for i, x in enumerate(y)]
 
-    return stored(moved)(y, h, *(slope for _, slope in terms))
+class _State(NamedTuple):
+    """``exp(log_scale) matrix`` at a time t, with two records of the march so far.
+
+    ``covariance`` is that of errors at t which were made at the ends of all panels: independent, each as large as the matrix
+    at its time. With the propagator P of a panel it obeys ``C' = P C P^T + |matrix|^2 I``. ``stiffness`` is the integral of
+    the largest rate max |a_ij a_ji|^(1/2), which no scaling of states changes, and ``decay`` that of ``-tr A``.
+    """
+
+    matrix: Array
+    log_scale: Array
+    covariance: Array
+    stiffness: Array
+    decay: Array
+
+    @classmethod
+    def start(cls, n: int, lanes: int) -> _State:
+        unit = jnp.broadcast_to(jnp.eye(n)[..., None], (n, n, lanes))
+        return cls(unit, jnp.zeros(lanes), jnp.zeros_like(unit), jnp.zeros(lanes), jnp.zeros(lanes))
+
+    def scaled_rows(self, d: int, factor: Any) -> _State:
+        """The states from number ``d`` on in another unit."""
+        n = len(self.matrix)
+        if d == n:
+            return self
+        rows = jnp.where((np.arange(n) < d)[:, None], 1.0, factor)
+        covariance = self.covariance * rows[:, None] * rows
+        return self._replace(matrix=self.matrix * rows[:, None], covariance=covariance)
+
+    def propagator(self, panels: Any) -> Propagator:
+        n = len(self.matrix)
+        variance = sum(self.covariance[i, i] for i in range(n)) / (n * panels * square_sum(self.matrix))
+        return Propagator(
+            self.matrix,
+            self.log_scale,
+            jnp.sqrt(variance),
+            self.stiffness,
+            self.decay,
+            0 * self.decay,
+            0 * self.decay - jnp.inf,
+        )
+
+
+class Fixed(NamedTuple):
+    """What a march needs of a system besides the time: values of its entries, the span, and the unit of displacements."""
+
+    values: list[Array]
+    span: Array
+    unit: Array
+
+
+class Panels:
+    """Panels of equal length over the span of a system without breakpoints."""
+
+    def __init__(self, system: LinearPeriodic) -> None:
+        unit, tableau = system.displacement_unit, gauss(STAGES)
+        self.size, self.basis = system.size, system.basis
+        self.scheme: Scheme = first_order(tableau) if unit is None else second_order(tableau)
+        self.d = system.size // len(self.scheme.start)
+        times = jnp.zeros((STAGES, 1))
+        split = staged(system.entries, *jax.eval_shape(system.basis, times))
+        self.moving = split.moving
+        self.suits = suits_one_kernel(lambda t: system.rows(*system.basis(t)), times)
+        self.fixed = Fixed(split.fixed, jnp.asarray(system.span, float), jnp.asarray(1.0 if unit is None else unit))
+
+    def propagator(self, fixed: Fixed, count: Array, number: Array) -> Array:
+        """The propagator of one of ``count`` panels, ``(n, n, lanes)``."""
+        h = fixed.span / count
+        rows = jnp.where((np.arange(self.size) < self.d)[:, None], 1.0, h * fixed.unit)
+        return panel(self.scheme, self.coefficients(fixed, h, number)) * rows / rows[:, None]
+
+    def through(self, fixed: Fixed, state: _State, count: Array, records: Array) -> _State:
+        """The state after ``count`` panels; with ``records`` its covariance and stiffness too."""
+        h = fixed.span / count
+        # The displacements' second state is their change in a panel.
+        unit = h * fixed.unit
+        onward = partial(self._onward, fixed, h, records)
+        state = jax.lax.fori_loop(0, count, onward, state.scaled_rows(self.d, unit))
+        return state.scaled_rows(self.d, 1 / unit)
+
+    def coefficients(self, fixed: Fixed, h: Array, number: Array) -> tuple[Array, ...]:
+        """``E_t`` of the scheme at the nodes of one panel, ``(s, d, d, lanes)``."""
+        times = (number + self.scheme.nodes[:, None]) * h
+        entries = self.moving(fixed.values, *self.basis(times))
+        return stored(self._blocks)(entries, h, h * fixed.unit)
+
+    def _blocks(self, entries: Entries, h: Array, unit: Array) -> tuple[Array, ...]:
+        if self.d == self.size:
+            return (self._block(entries, 0, 0, h),)
+        return self._block(entries, self.d, self.d, h), self._block(entries, self.d, 0, h * unit)
+
+    def _block(self, entries: Entries, row: int, column: int, factor: Any) -> Array:
+        places = list(np.ndindex(self.d, self.d))
+        block = [jnp.atleast_1d(factor * entries.get((row + i, column + j), jnp.zeros(()))) for i, j in places]
+        lanes = max(entry.shape[-1] for entry in block)
+        block = [jnp.broadcast_to(entry, (STAGES, lanes)) for entry in block]
+        if self.d > 2:
+            return jnp.stack(block, axis=1).reshape(STAGES, self.d, self.d, lanes)
+        # For few entries a sum is cheaper: the compiler turns a concatenation into a choice for every number.
+        masks = np.eye(len(places)).reshape(-1, self.d, self.d, 1)
+        return sum(mask * entry[:, None, None] for mask, entry in zip(masks, block, strict=True))  # pyright: ignore[reportReturnType]
+
+    def _onward(self, fixed: Fixed, h: Array, records: Array, number: Array, state: _State) -> _State:
+        coefficients = self.coefficients(fixed, h, number)
+        moved = panel(self.scheme, coefficients)
+        matrix = stored(matmul)(moved, state.matrix)
+        factor = stored(_factor)(matrix)
+        matrix = stored(jnp.multiply)(matrix, factor)
+        size = stored(square_sum)(matrix)
+
+        def recorded() -> tuple[Array, ...]:
+            carried = stored(matmul)(moved, state.covariance)
+            covariance = stored(_covariance)(carried, moved, factor, size)
+            stiffness, decay = stored(self._rates)(coefficients)
+            return covariance, state.stiffness + stiffness, state.decay + decay
+
+        records_now = state.covariance, state.stiffness, state.decay
+        covariance, stiffness, decay = jax.lax.cond(records, recorded, lambda: records_now)
+        # Logarithms cost as much as half a panel.
+        log_scale = jax.lax.cond(_any(factor != 1), lambda: state.log_scale - jnp.log(factor), lambda: state.log_scale)
+        return _State(matrix, log_scale, covariance, stiffness, decay)
+
+    def _rates(self, coefficients: tuple[Array, ...]) -> tuple[Array, Array]:
+        """The largest rate and ``-tr A``, integrated over the panel."""
+        first = coefficients[0]
+        pairs = [jnp.abs(first[:, i, j] * first[:, j, i]) for i in range(self.d) for j in range(i + 1)]
+        pairs += [jnp.abs(e[:, i, i]) for e in coefficients[1:] for i in range(self.d)]
+        weights = self.scheme.left[-1][:, None]
+        largest_rate = jnp.sqrt(reduce(jnp.maximum, pairs))
+        decay = reduce(jnp.subtract, (first[:, i, i] for i in range(self.d)), jnp.zeros(()))
+        integrals = [reduce(jnp.add, weights * x) for x in (largest_rate, decay)]
+        return integrals[0], integrals[1]
+
+
+def _covariance(carried: Array, moved: Array, factor: Array, size: Array) -> Array:
+    unit = np.eye(len(moved))[..., None]
+    return matmul(carried, jnp.swapaxes(moved, 0, 1)) * factor**2 + size * unit
+
+
+def _factor(matrix: Array) -> Array:
+    """The factor that brings a matrix far from 1 back to 1."""
+    size = largest(matrix)
+    return jnp.where((size > _FAR) | ((size < 1 / _FAR) & (size > 0)), 1 / size, 1.0)

@@ -164,10 +164,20 @@ class _Factor(NamedTuple):
 
 def factors(c: Coefficients) -> tuple[_Factor, _Factor]:
     """The two real quadratics."""
-    kappa, inverse = c.kappa, 1 / c.kappa
-    a, b, g = c.e1 * inverse, c.e2 * inverse**2, c.e3 * inverse**3
+    a, b, g = stored(_monic)(c.e1, c.e2, c.e3, c.kappa)
     plus, minus, e = (a + g) ** 2 / 4, (a - g) ** 2 / 4, 4 * b - 8
     w = _cubic_root((16 - e) / 16, (plus - minus - e) / 16, -minus / 16)
+    one, two = (stored(_factor)(*pair) for pair in stored(_pairs)(a, b, g, w, c.kappa))
+    return one, two
+
+
+def _monic(e1: Array, e2: Array, e3: Array, kappa: Array) -> tuple[Array, Array, Array]:
+    inverse = 1 / kappa
+    return e1 * inverse, e2 * inverse**2, e3 * inverse**3
+
+
+def _pairs(a: Array, b: Array, g: Array, w: Array, kappa: Array) -> tuple[tuple[Array, Array], ...]:
+    """Sum and modulus of the roots of both quadratics, the sum in units of the modulus."""
     cosh, sinh = jnp.sqrt(1 + w), jnp.sqrt(w)
     total = (a + g) / (2 * cosh)
     # a - g = 2 sinh(u) (p1 - p2) as well: of the two formulas for the difference use the one with the larger divisor.
@@ -175,13 +185,13 @@ def factors(c: Coefficients) -> tuple[_Factor, _Factor]:
     quotient = (a - g) / (2 * jnp.where(sinh > 0, sinh, 1.0))
     difference = jnp.where(sinh > difference, quotient, jnp.where(a < g, -difference, difference))
     growth = cosh + sinh
+    return ((total + difference) / 2, kappa * growth), ((total - difference) / 2, kappa / growth)
 
-    def factor(p: Array, m: Array) -> _Factor:
-        # p^2/4 - 1 as a product: exact where two roots meet.
-        radicand = (p / 2 - 1) * (p / 2 + 1)
-        return _Factor(m * p / 2, m, m * jnp.sqrt(jnp.abs(radicand)), radicand >= 0)
 
-    return factor((total + difference) / 2, kappa * growth), factor((total - difference) / 2, kappa / growth)
+def _factor(p: Array, m: Array) -> _Factor:
+    # p^2/4 - 1 as a product: exact where two roots meet.
+    radicand = (p / 2 - 1) * (p / 2 + 1)
+    return _Factor(m * p / 2, m, m * jnp.sqrt(jnp.abs(radicand)), radicand >= 0)
 
 
 def _unexplained(c: Coefficients, one: _Factor, two: _Factor) -> tuple[Array, ...]:

@@ -46,17 +46,23 @@ def with_path(values: Values, path: str, lanes: int) -> tuple[dict[str, Any], in
     return jax.tree.map(spread, dict(values)), length
 
 
-def in_blocks(function: Callable[[Any, int], Any], values: Any, lanes: int, size: int) -> Any:
+def in_blocks(
+    function: Callable[[Any, int], Any],
+    values: Any,
+    lanes: int,
+    size: int,
+    mark: Callable[[Callable], Callable] = lambda function: function,
+) -> Any:
     """``function(values, count)`` of ``lanes`` lanes in blocks of ``size``; its results have the lanes as last axis.
 
     Arrays among ``values`` with the lanes as last axis are cut into blocks; other values stay whole. ``size`` lanes fit into
-    the caches of a core; an accelerator computes all lanes at once.
+    the caches of a core; an accelerator computes all lanes at once. ``mark`` marks the loop over the blocks; all values are
+    then arrays of lanes.
     """
-    count = -(-lanes // size)
     leaves, tree = jax.tree.flatten(values)
     varying = [i for i, leaf in enumerate(leaves) if np.ndim(leaf) and np.shape(leaf)[-1] == lanes]
-    if count == 1 or not varying or not on_cpu():
-        return function(values, lanes)
+    if lanes <= size or not varying or not on_cpu():
+        return mark(lambda values: function(values, lanes))(values)
 
     def part(columns: list[Array]) -> Any:
         own = list(leaves)
@@ -64,14 +70,20 @@ def in_blocks(function: Callable[[Any, int], Any], values: Any, lanes: int, size
             own[i] = column
         return function(jax.tree.unflatten(tree, own), size)
 
-    def cut(leaf: Array) -> Array:
-        return jnp.moveaxis(_padded(leaf, count * size).reshape(*leaf.shape[:-1], count, size), -2, 0)
+    cut = [blocks_first(jnp.asarray(leaves[i]), size) for i in varying]
+    return jax.tree.map(lambda x: blocks_joined(x, lanes), mark(lambda columns: lax.map(part, columns))(cut))
 
-    def join(result: Array) -> Array:
-        whole = jnp.moveaxis(result, 0, -2)
-        return whole.reshape(*whole.shape[:-2], count * size)[..., :lanes]
 
-    return jax.tree.map(join, lax.map(part, [cut(jnp.asarray(leaves[i])) for i in varying]))
+def blocks_first(leaf: Array, size: int) -> Array:
+    """``leaf`` with its last axis cut into blocks of ``size``, the first axis; the last lane fills the last block."""
+    count = -(-leaf.shape[-1] // size)
+    return jnp.moveaxis(_padded(leaf, count * size).reshape(*leaf.shape[:-1], count, size), -2, 0)
+
+
+def blocks_joined(blocks: Array, lanes: int) -> Array:
+    """``lanes`` lanes as last axis, from blocks as first axis."""
+    whole = jnp.moveaxis(blocks, 0, -2)
+    return whole.reshape(*whole.shape[:-2], -1)[..., :lanes]
 
 
 def _padded(array: Array, lanes: int) -> Array:
@@ -154,7 +166,7 @@ def _at_once(
         return function(constants, *given)
     full = max(lanes, size)
     given = jax.tree.map(lambda x: _padded(x, full) if x.ndim and x.shape[-1] == lanes else x, given)
-    results = in_blocks(lambda own, _: _traced_once(function, constants, *own), given, full, size)
+    results = in_blocks(lambda own, _: traced_once(function, constants, *own), given, full, size)
     return jax.tree.map(lambda x: x[..., :lanes], results)
 
 
@@ -172,12 +184,13 @@ def _common(batch: int, lanes: int, x: Array, own: bool) -> Array:
         return jnp.max(x)
     if own:
         return jnp.broadcast_to(x if x.ndim > 1 else x[:, None], (batch, lanes)).reshape(-1)
-    return x if x.ndim == 0 else jnp.tile(x, batch)
+    return x if jnp.ndim(x) == 0 else jnp.tile(x, batch)
 
 
-def _traced_once(function: Callable[[Any, Any, Any], Any], constants: Constants, varying: Any, shared: Any) -> Any:
+def traced_once(function: Callable[[Any, Any, Any], Any], constants: Constants, varying: Any, shared: Any) -> Any:
     """``function(constants, varying, shared)`` by a cached trace; jax caches no traces across transformations."""
     leaves, tree = jax.tree.flatten((varying, shared))
+    leaves = [jnp.asarray(x) for x in leaves]
     kinds = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves)
     closed, results = _trace(function, constants, tree, kinds)
     return jax.tree.unflatten(results, jaxpr_as_fun(closed)(*leaves))

@@ -10,6 +10,8 @@ lanes of a batch go through the same sweeps, so the arithmetic vectorises. Compl
 
 from __future__ import annotations
 
+from functools import reduce
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +29,16 @@ _MAX_SWEEPS = 40
 def matmul(a: Array, b: Array) -> Array:
     """Product of matrices whose batch axes trail: ``(n, m, ...)`` times ``(m, k, ...)``."""
     return sum(a[:, j, None] * b[None, j] for j in range(a.shape[1]))  # pyright: ignore[reportReturnType]
+
+
+def square_sum(a: Array) -> Array:
+    """Sum of the squares of all entries, ``(n, m, ...) -> (...)``; unlike ``jnp.sum`` it may be part of a kernel."""
+    return sum(a[i, j] ** 2 for i in range(a.shape[0]) for j in range(a.shape[1]))  # pyright: ignore[reportReturnType]
+
+
+def largest(a: Array) -> Array:
+    """Largest modulus of all entries, ``(n, m, ...) -> (...)``, NaN if any is; may be part of a kernel."""
+    return reduce(jnp.maximum, (jnp.abs(a[i, j]) for i in range(a.shape[0]) for j in range(a.shape[1])))
 
 
 def looped_matmul(a: Array, b: Array | np.ndarray) -> Array:
