@@ -104,8 +104,23 @@ OPTIONS = {
 
 
 SLOW = (
-    *("cardan forced", "tripod history", "tripod lyapunov", "tripod poincare", "rattle frequency_response"),
-    *("bicardan critical_speeds", "planetary harmonic_response", "planetary modes", "rattle basins", "tripod floquet"),
+    *(
+        "cardan forced",
+        "cardan history",
+        "cardan lyapunov",
+        "cardan frequency_response",
+        "tripod history",
+        "tripod lyapunov",
+    ),
+    *(
+        "tripod poincare",
+        "rattle frequency_response",
+        "bicardan critical_speeds",
+        "planetary harmonic_response",
+        "planetary modes",
+        "rattle basins",
+        "tripod floquet",
+    ),
 )
 
 

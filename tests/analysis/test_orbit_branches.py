@@ -71,6 +71,7 @@ def test_history_of_the_shaft_against_scipy():
     np.testing.assert_allclose([getattr(found, name) for name in names], exact.y, atol=1e-8)
 
 
+@pytest.mark.full
 def test_exponents_of_the_straight_shaft():
     """Without joint angle the first and the last exponent are real parts of eigenvalues; those between converge slowly."""
     damped = {"beta": 0.0, "Omega": 1.0, "zeta": 0.05, "alpha": 1.0, "mu": 1.0, "gamma": 2.0}

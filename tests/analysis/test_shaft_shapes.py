@@ -315,6 +315,7 @@ def test_each_mode_of_a_multiple_frequency_moves_one_span(spans, support):
         assert np.abs(shape - expected).max() < 1e-12, number
 
 
+@pytest.mark.full
 def test_modes_of_a_frequency_that_parts_share_with_their_neighbours():
     """Three spans of one frequency with shear and rotary inertia, the middle one in two segments of another make."""
     shaft = {"length": (0.5, 0.25, 0.25, 0.5), "EI": (2e4,) * 4, "rhoA": (5.0,) * 4, "kGA": 1e7, "rhoI": 1e-3}
@@ -325,6 +326,7 @@ def test_modes_of_a_frequency_that_parts_share_with_their_neighbours():
 
 
 @pytest.mark.parametrize("more", [0.0, 1e-8])
+@pytest.mark.full
 def test_a_disc_that_moves_and_turns_at_one_frequency(more):
     """With I = m l^2/4, 48 EI/(m l^3) = 12 EI/(I l): both modes are mixtures, orthogonal in the mass of the disc. With a
     little more inertia the disc turns at a lower frequency than it moves."""

@@ -69,6 +69,7 @@ def test_an_ince_strutt_diagram_has_stable_regions(method):
     assert np.all(np.asarray(found.spectral_radius)[expected] == 1)
 
 
+@pytest.mark.full
 def test_masses_without_damping():
     """Modes in and against phase: Mathieu's equation with a and with a + 0.6."""
     found = jax.vmap(lambda a, q: dt.floquet(TwoMasses(a=a, q=q), outputs=OUTPUTS))(A.ravel(), Q.ravel())
@@ -84,6 +85,7 @@ def test_what_may_grow_is_not_called_stable(changes):
     assert int(dt.floquet(system(**given), outputs=["verdict"]).verdict) == 2
 
 
+@pytest.mark.full
 def test_methods_and_points_agree_with_an_atlas(tmp_path):
     fixed = {"zeta": 0.0, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
     axes = {"beta": {"start": 0.2, "stop": 0.6}, "Omega": {"start": 1.3, "stop": 1.5}}

@@ -64,6 +64,7 @@ def atlas_of(*given, **more) -> StoredAtlas:
 
 
 @pytest.mark.parametrize("beta", full_after(1, [(-0.3, 0.1), (-0.3, 0.0), (-0.1, 0.3)]))
+@pytest.mark.full
 def test_the_widest_angle_has_no_sign(beta):
     answer = atlas_answers.widest_angle(atlas_of(beta, (1.3, 1.5)), {"Omega": (1.35, 1.45)}).data
     assert answer["value"] == pytest.approx(S21[0], abs=1e-8) and answer["check"]["agrees"]

@@ -104,6 +104,7 @@ def test_the_file_of_an_atlas_shows_a_chart_without_this_package(stored, atlas):
     assert bool((abs(chart.spectral_radius - expected.spectral_radius) <= bound).all())
 
 
+@pytest.mark.full
 def test_the_stored_chart_of_three_parameters_lies_in_the_middle_of_the_third():
     axes = {
         "Omega": {"start": 1.9, "stop": 2.0},

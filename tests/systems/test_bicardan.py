@@ -177,6 +177,7 @@ def test_the_determinant_dies_near_mode_12(swept):
     np.testing.assert_allclose(result.angular_frequency.values[[0, 2], :5], certified, rtol=1e-11)
 
 
+@pytest.mark.full
 def test_a_stiffer_support_lowers_the_amplitudes_at_the_characteristic_points():
     """Conclusion 3 of the paper, f_A = 1 and k_D from 20e6 to 85e6; expected from transfer matrices in 40 digits."""
     stations, points = 92, [7, 66, 91]
