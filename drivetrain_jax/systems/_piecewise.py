@@ -1,7 +1,8 @@
-"""A driven oscillator with a play in its spring: linear in each of three regions, continuous between them.
+"""A driven oscillator with a play in its spring: linear in each of three regions.
 
 Equation: ``u'' + damping u' + stiffness f_s(u) = B0 + B1 cos(omega t)`` with
-``f_s = u - (1 - alpha) b`` for ``u > b``, ``alpha u`` for ``|u| <= b``, ``u + (1 - alpha) b`` for ``u < -b``.
+``f_s = u - (1 - alpha) b`` for ``u > b``, ``alpha u`` for ``|u| <= b``, ``u + (1 - alpha) b`` for ``u < -b``. The damper
+acts always, or in contact only (``|u| > b``): the force then jumps at a flank, unless ``u' = 0`` there.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax._errors import InputError
+
 
 class PiecewiseLinearOscillator(eqx.Module):
     """The equation in the module's docstring; every field is a number or an array, all of one common shape ``(...)``.
@@ -24,6 +27,8 @@ class PiecewiseLinearOscillator(eqx.Module):
 
     An ``unbalance`` [m] adds ``unbalance omega^2`` to B1 along a range of frequencies. The equation itself, and all that
     solves it at one frequency, take :meth:`at`. The number 0.0 stands for none.
+
+    ``damps_play`` is false if the damper acts in contact only; exact methods serve both.
     """
 
     damping: Any
@@ -34,6 +39,13 @@ class PiecewiseLinearOscillator(eqx.Module):
     B1: Any
     omega: Any
     unbalance: Any = 0.0
+    damps_play: bool = eqx.field(static=True, default=True)
+
+    @staticmethod
+    def check_method(damps_play: bool, method: str) -> None:
+        """Raise :class:`InputError` for an approximate method, unless the damper always acts."""
+        if not damps_play and method != "exact":
+            raise InputError(f"options.method = {method!r}: allowed for a damper in contact only is 'exact'")
 
     @property
     def follows(self) -> bool:
@@ -68,12 +80,13 @@ class PiecewiseLinearOscillator(eqx.Module):
     def field(self, t: Any, state: Array) -> Array:
         """``(u', u'')`` of ``state = (u, u')``, shape ``(2, ...)``.
 
-        The field is continuous, but its derivative jumps where :meth:`switching` changes sign: integrators must locate the
-        jumps.
+        Its derivative jumps where :meth:`switching` changes sign, and the field itself with a damper in contact only:
+        integrators must locate the jumps.
         """
         u, v = state
+        damping = self.damping if self.damps_play else jnp.where(jnp.abs(u) > self.b, self.damping, 0.0)
         drive = self.B0 + self.B1 * jnp.cos(self.omega * t)
-        return jnp.stack(jnp.broadcast_arrays(v, drive - self.damping * v - self.stiffness * self.restoring(u)))
+        return jnp.stack(jnp.broadcast_arrays(v, drive - damping * v - self.stiffness * self.restoring(u)))
 
     def switching(self, state: Array) -> Array:
         """Distances ``(u - b, u + b)`` to the flanks, where the derivative jumps, shape ``(2, ...)``."""

@@ -11,6 +11,8 @@ I_y r_x^2)`` the equivalent mass, and ``B0 + B1 cos(omega t) = M_x r_x/I_x + M_y
 :class:`~drivetrain_jax.systems.PiecewiseLinearOscillator`. With r in m, u and b are lengths, k, c
 and I the stiffness, damping and mass along the line of action. Table 1 lists b as 10 deg, read here as the number pi/18: the
 equation is homogeneous in u, b, B0 and B1, so that any unit of length is valid.
+
+The damper of the paper acts always. With ``damping = "contact"`` it acts only while the flanks touch, ``|u| > b``.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ PRESETS = {"table1": {"B0": 0.05, "B1": 0.03, "b": math.pi / 18, "c": 0.05, "alp
 
 
 POSITIVE = {"lower": 0.0, "open_lower": True}
-_MOTION = ("omega", "B0", "B1", "b", "c", "alpha", "k", "I", "unbalance")
+_MOTION = ("omega", "B0", "B1", "b", "c", "alpha", "k", "I", "unbalance", "damping")
 
 
 class Rattle(System):
@@ -67,6 +69,7 @@ class Rattle(System):
     k: Number = parameter("N/m", "stiffness in contact", **POSITIVE)
     I: Number = parameter("kg", "equivalent mass", **POSITIVE)  # noqa: E741
     unbalance: Number | None = parameter("m", "unbalance: adds unbalance omega^2 to B1", derived="none")
+    damping: str = parameter("1", "where the damper acts", default="always", choices=("always", "contact"))
     u0: Number = parameter("m", "relative displacement at t = 0", default=0.0)
     v0: Number = parameter("m/s", "relative velocity at t = 0", default=0.0)
 
@@ -89,6 +92,7 @@ class Rattle(System):
             B1=self.B1,
             omega=self.omega,
             unbalance=0.0 if self.unbalance is None else self.unbalance,
+            damps_play=self.damping == "always",
         )
 
     def vector_field(self, t: Any, y: Array) -> Array:

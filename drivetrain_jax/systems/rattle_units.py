@@ -26,7 +26,7 @@ PHYSICAL = PhysicalData(
         Parameter("speed", "rpm", "speed of the driving gear", **POSITIVE),
         Parameter("backlash", "m", "backlash along the line of action, from flank to flank", lower=0.0),
         Parameter("mesh_stiffness", "N/m", "stiffness in contact, along the line of action", **POSITIVE),
-        Parameter("damping_ratio", "1", "damping ratio in contact; the damper acts within the backlash too", lower=0.0),
+        Parameter("damping_ratio", "1", "damping ratio in contact", lower=0.0),
     ),
     (
         Conversion(

@@ -34,7 +34,7 @@ def test_step_response_solves_its_equation(stiffness):
     mp = pytest.importorskip("mpmath")
     model = Rattle.models["basins"].build(TABLE1 | {"c": 1.0, "omega": 1.0})
     for d in (1e-6, 0.01, 0.3, 0.7, 3.0, 20.0):
-        got = [float(x) for x in responses(piece(model, jnp.asarray(stiffness)), jnp.asarray(d))]
+        got = [float(x) for x in responses(piece(model, jnp.asarray(stiffness), model.damping), jnp.asarray(d))]
         with mp.workdps(60):
             h, k, t = mp.mpf("0.5"), mp.mpf(stiffness), mp.mpf(d)
             root = mp.sqrt(mp.mpc(h * h - k)) if h * h != k else mp.mpf("1e-25")

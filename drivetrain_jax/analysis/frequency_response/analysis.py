@@ -116,6 +116,7 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
         if request.method not in _ONLY.get(name, (request.method,)):
             methods = ", ".join(_ONLY[name])
             raise InputError(f"outputs: method {request.method} does not give {name}; allowed for it is {methods}")
+    PiecewiseLinearOscillator.check_method(fixed.get("damping") != "contact", request.method)
     for name in () if fixed.get("unbalance") is None else _OF_ONE_DRIVE.intersection(request.outputs):
         if request.method != "exact":
             raise InputError(
@@ -148,6 +149,7 @@ def _solve(
     """A line; ``effort`` only orders the batches."""
     del effort
     model, unit = to_scaled_length(build(values))
+    model.check_method(model.damps_play, request.method)
     options, shape = request.options, _shape(model)
     if request.method == "exact":
         results = _exact(model, request)

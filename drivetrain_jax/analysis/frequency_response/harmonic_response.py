@@ -5,6 +5,7 @@ Results are arrays ``(L, own dimensions, ...)``, the path first, the batch last.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -113,11 +114,11 @@ def response(
     """
     omega = np.asarray(model.omega)
     lanes = shape or (1,)
-    own = {name: value for name, value in vars(model).items() if name != "omega"}
+    own = {name: value for name, value in vars(model).items() if name not in ("omega", "damps_play")}
     if not model.follows:
         del own["unbalance"]
     fields = {name: jnp.broadcast_to(value, lanes) for name, value in own.items()}
-    model = PiecewiseLinearOscillator(**fields, omega=None)
+    model = replace(model, **fields, omega=None)
     swept_x, balanced, saddle = _sweeps(model, basis, omega, lanes)
 
     def directions(at: tuple[Array, Array, Array, Array]) -> Described:
@@ -146,7 +147,7 @@ def _sweeps(
     """
     fine, places = refined(omega, _LARGEST_STEP, _MOST_PARTS)
     twice = {name: jnp.tile(value, 2) for name, value in vars(model).items() if name != "omega" and jnp.ndim(value)}
-    both = PiecewiseLinearOscillator(**twice, omega=None)
+    both = replace(model, **twice)
     paths = np.repeat(np.stack([fine, fine[::-1]], axis=1), lanes[0], axis=1)
     swept = sweep(both, basis, jnp.asarray(paths))
     x = swept.x.reshape(len(fine), basis.size, 2, *lanes)

@@ -69,7 +69,8 @@ def variables(system: type[System]) -> tuple[Variable, ...]:
 
 def dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     """Dimensions of times and events; raises ``InputError`` for a result that the method does not compute."""
-    del system, fixed
+    del system
+    PiecewiseLinearOscillator.check_method(fixed.get("damping") != "contact", request.method)
     for variable in _AVERAGED if request.method == "exact" else _EXACT:
         if variable.name in request.outputs:
             other = next(method for method in METHODS if method != request.method)
@@ -156,6 +157,7 @@ def _averaged(system: type[System], request: Request, values: Mapping[str, Any],
     """The requested results of one point."""
     del effort
     model: PiecewiseLinearOscillator = system.models["history"].build(values)
+    model.check_method(model.damps_play, request.method)
     u0, v0 = (jnp.asarray(values[system.role(role)], float) for role in _STARTS)
     scaled, unit = to_scaled_length(model)
     given = request.options["fit_range"]

@@ -47,7 +47,7 @@ from drivetrain_jax.analysis.impacts.piecewise_march import (
     prepare,
     stays,
 )
-from drivetrain_jax.analysis.impacts.plane_map import Matrix, newton_correction
+from drivetrain_jax.analysis.impacts.plane_map import Matrix, log_determinant, newton_correction
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 # Newton: most corrections, relative size of the last correction, and size below which corrections may stall by rounding.
@@ -132,7 +132,8 @@ def _shoot(
     converged = (change <= _CONVERGED * size) | stuck
     astray = ~(_speed(local, *guess) <= _ASTRAY * (_speed(local, *lane.latest) + _usual_speed(local)))
     going = now & ~converged & (lane.corrections < _CORRECTIONS) & ~astray & (change <= _SHRINKING * lane.change)
-    orbit = Orbit(*guess, motion.matrix, -local.damping * lane.multiple * 2 * np.pi / omega, change + rounding)
+    contraction = log_determinant(local, motion.matrix, lane.multiple * 2 * np.pi / omega)
+    orbit = Orbit(*guess, motion.matrix, contraction, change + rounding)
     stable = now & converged & attracts(orbit)
     slow = (
         stable & is_slow(orbit, lane.latest, omega) & ~linearisation_holds(orbit, lane.latest, first, local.b, omega)[0]

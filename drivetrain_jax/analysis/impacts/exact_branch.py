@@ -18,7 +18,7 @@ from drivetrain_jax.analysis.impacts.attractor import take
 from drivetrain_jax.analysis.impacts.motion import ABSENT, STABLE, UNSTABLE
 from drivetrain_jax.analysis.impacts.orbit_measures import measure
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
-from drivetrain_jax.analysis.impacts.plane_map import newton_correction, spectral_radius
+from drivetrain_jax.analysis.impacts.plane_map import log_determinant, newton_correction, spectral_radius
 from drivetrain_jax.analysis.numerics.branch_sections import course, distinct, sections
 from drivetrain_jax.analysis.numerics.continuation import Mapped, PeriodMap, folds_and_doublings, follow
 from drivetrain_jax.systems import PiecewiseLinearOscillator
@@ -167,7 +167,8 @@ def _described(model: PiecewiseLinearOscillator, states: Array, exists: Array, w
     one = jnp.ones(exists.shape, jnp.int32)
     seen = measure(model, found[0], found[1], one, width=min(width, exists.size), integrals=False)
     there = jnp.isfinite(found[0]) & (seen.complete == 1)
-    rho = spectral_radius(tuple(found[2:]), -model.damping * model.period)
+    matrix = tuple(found[2:])
+    rho = spectral_radius(matrix, log_determinant(model, matrix, model.period))
     stability = jnp.where(rho > 1 + _MARGIN, UNSTABLE, STABLE)
     return {
         "branch_u_max": jnp.where(there, seen.high, jnp.nan),

@@ -20,7 +20,7 @@ from drivetrain_jax.analysis.impacts.attractor import Attractors, attractors, av
 from drivetrain_jax.analysis.impacts.attractor_lanes import MOST_PERIODS
 from drivetrain_jax.analysis.impacts.motion import ABSENT, REGIMES, STABLE, UNSTABLE, phase_lag, regime
 from drivetrain_jax.analysis.impacts.orbit_measures import Measures, measure
-from drivetrain_jax.analysis.impacts.plane_map import spectral_radius
+from drivetrain_jax.analysis.impacts.plane_map import log_determinant, spectral_radius
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 NON_PERIODIC = REGIMES.index("non_periodic")
@@ -97,12 +97,12 @@ def periodic_results(oscillator: PiecewiseLinearOscillator, seen: Measures) -> d
     span = seen.periods * oscillator.period
     mean, square, cosine, sine = (integral / span for integral in seen.integrals)
     size = jnp.maximum(jnp.abs(seen.high), jnp.abs(seen.low))
-    log_determinant = -oscillator.damping * span
-    half, determinant = (seen.matrix[0] + seen.matrix[3]) / 2, jnp.exp(log_determinant)
+    contraction = log_determinant(oscillator, seen.matrix, span)
+    half, determinant = (seen.matrix[0] + seen.matrix[3]) / 2, jnp.exp(contraction)
     root = jnp.sqrt((half**2 - determinant).astype(complex))
     # The larger multiplier first; the smaller one from the product loses no digits.
     first = half + jnp.where(half < 0, -root, root)
-    rho = spectral_radius(seen.matrix, log_determinant)
+    rho = spectral_radius(seen.matrix, contraction)
     return {
         "u_max": seen.high,
         "u_min": seen.low,

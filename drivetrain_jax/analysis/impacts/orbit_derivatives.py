@@ -7,7 +7,7 @@ oscillator. The orbit moves by ``dz = (1 - dF/dz)^-1 dF/dp dp``. Every result de
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import equinox as eqx
@@ -25,7 +25,7 @@ from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 # At one frequency the unbalance is part of B1.
-_FIELDS = tuple(field.name for field in fields(PiecewiseLinearOscillator) if field.name != "unbalance")
+_FIELDS = tuple(f.name for f in fields(PiecewiseLinearOscillator) if f.name not in ("unbalance", "damps_play"))
 # Fields whose range ends at zero: there the oscillator has other formulas, and no derivative.
 _ENDS = np.array([name in ("alpha", "b") for name in _FIELDS])
 
@@ -54,7 +54,7 @@ def orbit_jacobians(
     multiple = jnp.maximum(results["period_multiple"], 1)
 
     def motion(x: Array) -> dict[str, Array]:
-        oscillator, u, v = PiecewiseLinearOscillator(*x[:-2]), x[-2:-1], x[-1:]
+        oscillator, u, v = replace(scaled, **dict(zip(_FIELDS, x[:-2], strict=True))), x[-2:-1], x[-1:]
         seen = measure(oscillator, u, v, multiple[None], width=1, integrals=not INTEGRALS.isdisjoint(names))
         found = {name: value[..., 0] for name, value in periodic_results(oscillator, seen).items() if name in names}
         if not {"u_history", "v_history"}.isdisjoint(names):

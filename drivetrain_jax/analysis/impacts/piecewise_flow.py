@@ -8,7 +8,7 @@ and ``y = x'``, and with the step response P and impulse response S = P' of the 
 
 ``[[1 - K P, S], [-K S, S']]`` is the transition matrix; its determinant is ``exp(-C d)``. Neither K = 0 nor critical
 damping is singular in this form. As the spring force is continuous, the transition matrix of a motion is the product of
-the transition matrices of its steps.
+the transition matrices of its steps, with a factor where the damping jumps (:mod:`.piecewise_march`).
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class Piece(NamedTuple):
     sine: Array
 
 
-def piece(oscillator: PiecewiseLinearOscillator, stiffness: Array) -> Piece:
-    """The region of this stiffness. The harmonic response of an undamped region at resonance is not finite."""
-    h, omega = oscillator.damping / 2, oscillator.omega
+def piece(oscillator: PiecewiseLinearOscillator, stiffness: Array, damping: Array) -> Piece:
+    """The region of this stiffness and damping. The harmonic response of an undamped region at resonance is not finite."""
+    h, omega = damping / 2, oscillator.omega
     q = stiffness - h**2
     overdamped = jnp.zeros_like(q, bool) if isinstance(oscillator, UnderdampedOscillator) else q < 0
     root = jnp.maximum(jnp.sqrt(jnp.abs(q)), _TINY)
@@ -52,7 +52,7 @@ def piece(oscillator: PiecewiseLinearOscillator, stiffness: Array) -> Piece:
     slow = jnp.where(overdamped, -stiffness / jnp.maximum(h + root, _TINY), -h)
     fast = jnp.where(overdamped, -(h + root), -h)
     rate = jnp.where(overdamped, h + root, jnp.sqrt(stiffness))
-    detuning, lag = stiffness - omega**2, oscillator.damping * omega
+    detuning, lag = stiffness - omega**2, damping * omega
     scale = oscillator.B1 / (detuning**2 + lag**2)
     fields = (stiffness, h, root, overdamped, slow, fast, rate, scale * detuning, scale * lag)
     return Piece(*jnp.broadcast_arrays(*(jnp.asarray(field) for field in fields)))

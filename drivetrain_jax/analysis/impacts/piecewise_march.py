@@ -5,6 +5,10 @@ certainly stays within its linear region. Steps therefore shrink towards a flank
 crossing. A step has a least length, which carries the lane over the flank. The excess, 1e-12 of the shortest time scale,
 changes the velocity by a relative 1e-24, because the force is continuous. Its effect of 1e-12 on the transition matrix is
 corrected.
+
+With a damper in contact only the damping jumps by j at a flank, and the acceleration by -j v. A neighbour that reaches the
+flank later by dt = -du/v then has its velocity changed by -j du: the transition matrix has the factor [[1, 0], [-j, 1]]. The
+effect of the excess on the velocity is corrected too.
 """
 
 from __future__ import annotations
@@ -42,7 +46,10 @@ FEW = 8
 
 
 class Lanes(NamedTuple):
-    """An oscillator with its derived constants: regions, flanks and time scales, each of shape ``(N,)``."""
+    """An oscillator with its derived constants: regions, flanks and time scales, each of shape ``(N,)``.
+
+    ``jump``: damping in contact minus damping within the play; None if the damper always acts.
+    """
 
     contact: Piece
     gap: Piece
@@ -53,6 +60,7 @@ class Lanes(NamedTuple):
     omega: Array
     period: Array
     least: Array
+    jump: Array | None
 
 
 def prepare(oscillator: PiecewiseLinearOscillator, span: float = np.inf) -> Lanes:
@@ -61,7 +69,9 @@ def prepare(oscillator: PiecewiseLinearOscillator, span: float = np.inf) -> Lane
     Without backlash the position of the flanks is negative and contact is permanent.
     """
     stiffness, b = jnp.asarray(oscillator.stiffness), jnp.asarray(oscillator.b)
-    contact, gap = piece(oscillator, stiffness), piece(oscillator, oscillator.alpha * stiffness)
+    damping = jnp.asarray(oscillator.damping)
+    contact = piece(oscillator, stiffness, damping)
+    gap = piece(oscillator, oscillator.alpha * stiffness, damping if oscillator.damps_play else 0 * damping)
     period = jnp.asarray(oscillator.period)
     latest = jnp.minimum(period, span)
     least = jnp.maximum(_LEAST_STEP / jnp.maximum(contact.rate, gap.rate), _LEAST_PART * latest)
@@ -75,6 +85,7 @@ def prepare(oscillator: PiecewiseLinearOscillator, span: float = np.inf) -> Lane
         jnp.asarray(oscillator.omega),
         period,
         least,
+        None if oscillator.damps_play else damping,
     )
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in jax.tree.leaves(lanes)))
     return jax.tree.map(lambda x: jnp.broadcast_to(x, shape), lanes)
@@ -161,12 +172,16 @@ def _overdue(lanes: Lanes, here: Here, u: Array, v: Array, d: Array) -> Array:
 
     The step has the length ``d`` and ends in ``(u, v)``.
     """
+    inside = here.side == 0
     over = jnp.abs(u) - lanes.flank
+    over = jnp.where(inside, over, -over)
     # A lane that reverses at the flank may be beyond it during the whole step; a lane at rest on the flank is not.
-    late = jnp.minimum(jnp.abs(over) / jnp.maximum(jnp.abs(v), 1e-300), d)
-    late = jnp.where(jnp.abs(over) > _ON_FLANK * lanes.flank, late, 0.0)
-    left = (jnp.abs(here.side) == 1) & (over < 0)
-    return jnp.where((here.side == 0) & (over > 0), late, jnp.where(left, -late, 0.0))
+    passes = (jnp.abs(over) <= 2 * jnp.abs(v) * d) & (v != 0)
+    late = jnp.where(passes, over / jnp.where(passes, jnp.abs(v), 1.0), d)
+    value = jnp.where(over > _ON_FLANK * lanes.flank, jnp.minimum(late, d), 0.0)
+    # The derivative is that of the time of the crossing, also where rounding leaves no excess.
+    late = late + jax.lax.stop_gradient(value - late)
+    return jnp.where(inside & (over > 0), late, jnp.where((jnp.abs(here.side) == 1) & (over >= 0), -late, 0.0))
 
 
 def advance(lanes: Lanes, here: Here, motion: Motion, d: Array) -> Motion:
@@ -189,8 +204,15 @@ def advance(lanes: Lanes, here: Here, motion: Motion, d: Array) -> Motion:
         p21 * m11 + rate * m21,
         p21 * m12 + rate * m22,
     )
-    turned = _overdue(lanes, here, u, v, d) * (lanes.contact.stiffness - lanes.gap.stiffness)
-    matrix = m11, m12, m21 - turned * m11, m22 - turned * m12
+    overdue = _overdue(lanes, here, u, v, d)
+    turned, kept = overdue * (lanes.contact.stiffness - lanes.gap.stiffness), 1.0
+    if lanes.jump is not None:
+        touches, touched = jnp.abs(u) > lanes.flank, jnp.abs(here.side) == 1
+        crossed = jnp.where(here.side == 2, 0.0, touches * 1.0 - touched)
+        turned = turned + crossed * lanes.jump - overdue * lanes.jump**2 * touches
+        kept = 1 - overdue * lanes.jump
+        v = kept * v
+    matrix = kept * m11, kept * m12, m21 - turned * m11, m22 - turned * m12
     return Motion(time, cosine, sine, u, v, matrix, motion.left - ends, motion.steps + 1)
 
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+
+from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 # Four entries, row by row.
 Matrix = tuple[Array, ...]
@@ -14,6 +17,13 @@ def spectral_radius(matrix: Matrix, log_determinant: Array) -> Array:
     half = (matrix[0] + matrix[3]) / 2
     gap = half**2 - jnp.exp(log_determinant)
     return jnp.where(gap > 0, jnp.abs(half) + jnp.sqrt(jnp.maximum(gap, 0.0)), jnp.exp(log_determinant / 2))
+
+
+def log_determinant(oscillator: PiecewiseLinearOscillator, matrix: Matrix, span: Array) -> Array:
+    """Logarithm of the determinant of the transition over ``span``: exact if the damper always acts, else by the matrix."""
+    if oscillator.damps_play:
+        return -oscillator.damping * span
+    return jnp.log(jnp.maximum(matrix[0] * matrix[3] - matrix[1] * matrix[2], np.finfo(float).tiny))
 
 
 def newton_correction(matrix: Matrix, du: Array, dv: Array) -> tuple[Array, Array]:
