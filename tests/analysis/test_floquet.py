@@ -135,7 +135,7 @@ def test_bound_counts_rounding_that_both_step_sizes_share(direct, rtol):
     assert found["verdict"].tolist() == [STABLE, UNDECIDED, UNDECIDED]
 
 
-# Columns as above; points that the implicit scheme solves at a tolerance of 1e-13.
+# Columns as above; strong damping.
 TOO_LONG_TO_MARCH = (
     (1.1752422858416216, 0.1533373642851158, 0.000031524877051342704379),
     (1.177266820356422, 0.15211986425991417, 0.000036121927451657249321),
@@ -145,7 +145,7 @@ TOO_LONG_TO_MARCH = (
 
 
 @pytest.mark.full
-def test_bound_counts_rounding_of_the_implicit_scheme(direct):
+def test_bound_counts_rounding_of_strong_damping(direct):
     beta, omega, exact = map(np.array, zip(*TOO_LONG_TO_MARCH, strict=True))
     shaft = {
         "zeta": 1.2355069626811421,

@@ -92,7 +92,7 @@ def test_a_system_in_seconds_has_a_rate():
 
 
 def test_undecided_says_what_to_do():
-    """Where an undamped tongue begins, two multipliers are -1."""
+    """Two multipliers are -1 at the foot of an undamped tongue."""
     undamped = {"beta": 0.0, "Omega": 1.41598463971976, "zeta": 0.0, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
     found = dt.point("cardan", "floquet", **undamped)
     assert found.verdict == 2 and found.growth == {}

@@ -51,7 +51,7 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
 
 
 # Target of the predicted panels of derivatives, tight because derivatives lose some digits against multipliers.
-_DERIVATIVES = 1e-11
+_DERIVATIVES = 1e-13
 
 
 @jax.custom_jvp

@@ -114,10 +114,8 @@ class Gauss(diffrax.AbstractSolver):
     def solved(self, system: LinearPeriodic) -> tuple[Array, Monodromy]:
         """The propagator over the span, and the monodromy matrix."""
         arrays, rest = eqx.partition(system, eqx.is_array)
-        fixed, shared = (
-            Constants(rest),
-            (jnp.asarray(self.panels), jnp.asarray(self.rtol, float), jnp.asarray(self.ratio)),
-        )
+        fixed = Constants(rest)
+        shared = jnp.asarray(self.panels), jnp.asarray(self.rtol, float), jnp.asarray(self.ratio)
         if not jax.tree.leaves(arrays) or not system.is_pytree:
             # No arrays to batch, or a function that may depend on unknown arrays.
             return jax.tree.map(lambda x: x[..., 0], _refined(fixed, arrays, shared))
@@ -160,10 +158,12 @@ def _refined(fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array, Arra
     numbers: list[Any] = []
 
     def prepared(arrays: LinearPeriodic) -> tuple[Any, Any, Any]:
-        """What does not change during the march, for all blocks at once."""
+        """Values that do not change during the march, for all blocks at once."""
         system = eqx.combine(arrays, fixed.tree)
         marches[:] = [Panels(part) for part in system.parts]
-        ends, numbers[:] = _arrays_and_numbers(system.ends())
+        # Numbers among the entries stay known while the kernel is traced.
+        ends, known = eqx.partition(system.ends(), eqx.is_array)
+        numbers[:] = [known]
         return [march.fixed for march in marches], ends, system.log_determinant and system.log_determinant()
 
     axes = jax.tree.map(lambda x, cut: 0 if cut.ndim > x.ndim else None, arrays, blocks)
@@ -182,12 +182,6 @@ def _refined(fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array, Arra
 
     mark = in_one_kernel if all(march.suits for march in marches) else lambda function: function
     return jax.tree.map(lambda x: blocks_joined(x, lanes), mark(all_blocks)(shared, packed))
-
-
-def _arrays_and_numbers(rows: Any) -> tuple[Any, list[Any]]:
-    """The arrays among the entries, and the numbers, which stay known while the kernel is traced."""
-    arrays, numbers = eqx.partition(rows, eqx.is_array)
-    return arrays, [numbers]
 
 
 def _agreeing(
@@ -289,7 +283,7 @@ class _State(NamedTuple):
 
 
 class Fixed(NamedTuple):
-    """What a march needs of a system besides the time: values of its entries, the span, and the unit of displacements."""
+    """Values of a system that do not change during the march: of its entries, the span, and the unit of displacements."""
 
     values: list[Array]
     span: Array
