@@ -47,9 +47,9 @@ def _scene(analysis: str, outputs: Sequence[str], rest: Mapping[str, Any]) -> di
 
 def frequencies_section() -> str:
     """Natural frequencies and Tables 1-2."""
-    from drivetrain_jax.resonances import cardan
+    from drivetrain_jax import resonances
 
-    exact, independent = cardan.natural_frequencies(1.0, 100.0), natural_frequencies()
+    exact, independent = resonances.natural_frequencies(1.0, 100.0), natural_frequencies()
     rows = [
         [
             f"omega{i + 1}",
@@ -157,9 +157,9 @@ def trends_section() -> str:
 
 
 def _speeds_mu20() -> str:
-    from drivetrain_jax.resonances import cardan
+    from drivetrain_jax import resonances
 
-    speeds = predicted_speeds(cardan.natural_frequencies(20.0, 100.0))
+    speeds = predicted_speeds(resonances.natural_frequencies(20.0, 100.0))
     return ", ".join(f"{speeds[name]:.3f}" for name in ("S21", "C+1", "H21"))
 
 

@@ -100,7 +100,7 @@ class DrivetrainAccessor:
 
         Raises: InputError for a result without frequencies, or of a system whose orders are not known.
         """
-        from drivetrain_jax.resonances.orders import FREQUENCIES, in_hertz, stored_orders
+        from drivetrain_jax.resonances import FREQUENCIES, in_hertz, stored_orders
 
         self._analysis()
         orders = stored_orders(self._dataset.attrs)

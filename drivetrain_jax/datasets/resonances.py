@@ -9,18 +9,10 @@ import numpy as np
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.resonances import Resonances, cardan, rattle
+from drivetrain_jax.resonances import BUILT_IN, Resonances
 from drivetrain_jax.view.style import is_joined, scene_key
 
 LABELS = "resonance"
-# Predictions of the systems of this package, so that their figures need no jax.
-BUILT_IN = {
-    "cardan": cardan.RESONANCES,
-    "rattle": rattle.THRESHOLD,
-    "tripod": None,
-    "planetary": None,
-    "bicardan": None,
-}
 
 
 def resonances(dataset: xr.Dataset) -> xr.DataArray | None:

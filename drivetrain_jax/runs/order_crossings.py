@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from drivetrain_jax._wording import aligned
-from drivetrain_jax.resonances.orders import FREQUENCIES, Orders, in_hertz, operating_range, orders_of
+from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range, orders_of
 from drivetrain_jax.runs.scene import Scene
 
 

@@ -15,7 +15,7 @@ from drivetrain_jax._wording import shown
 from drivetrain_jax.analysis.request import checked
 from drivetrain_jax.runs.axes import Axis, entry_of
 from drivetrain_jax.systems import PhysicalData, System
-from drivetrain_jax.systems._physical import Along
+from drivetrain_jax.systems._base import Along
 
 # The axis of the values of points.
 _POINT = "points"

@@ -11,15 +11,23 @@ from importlib import import_module
 from drivetrain_jax._plugins import SYSTEMS, load_plugin, plugin_names
 from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
 from drivetrain_jax.resonances import Family, Resonances
-from drivetrain_jax.systems._base import Model, System, parameter, serves
-from drivetrain_jax.systems._flow import Flow
-from drivetrain_jax.systems._modal import Block, DrivenSprings, SpringSystem
-from drivetrain_jax.systems._periodic import FloquetModel, ForcedModel, LinearPeriodic
-from drivetrain_jax.systems._physical import Conversion, PhysicalData
-from drivetrain_jax.systems._piecewise import PiecewiseLinearOscillator, UnderdampedOscillator
-from drivetrain_jax.systems._rows import dense
-from drivetrain_jax.systems._shaft import Shaft
-from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness
+from drivetrain_jax.systems._base import Conversion, Model, PhysicalData, System, parameter, serves
+from drivetrain_jax.systems._models import (
+    Block,
+    Coordinate,
+    DrivenSprings,
+    FloquetModel,
+    Flow,
+    ForcedModel,
+    LinearPeriodic,
+    PiecewiseLinearOscillator,
+    Series,
+    Shaft,
+    Smoothness,
+    SpringSystem,
+    UnderdampedOscillator,
+    dense,
+)
 
 _BUILT_IN = {
     "cardan": "Cardan",

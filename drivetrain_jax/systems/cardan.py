@@ -20,18 +20,139 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
-from drivetrain_jax._quantities import Component, Dimension
-from drivetrain_jax.resonances.cardan import RESONANCES
-from drivetrain_jax.systems._base import Number, System, numeric, parameter, serves
-from drivetrain_jax.systems._flow import Components, Flow
-from drivetrain_jax.systems._periodic import SWAP, FloquetModel, ForcedModel, LinearPeriodic
-from drivetrain_jax.systems._rows import Rows
-from drivetrain_jax.systems._smooth import Coordinate, Series, Smoothness
-from drivetrain_jax.systems.cardan_clock import clock, clock_basis, panels_needed
-from drivetrain_jax.systems.cardan_units import PHYSICAL
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Component, Dimension, Parameter
+from drivetrain_jax.resonances import CARDAN
+from drivetrain_jax.systems._base import (
+    POSITIVE,
+    RPM,
+    Conversion,
+    Number,
+    PhysicalData,
+    System,
+    numeric,
+    parameter,
+    serves,
+)
+from drivetrain_jax.systems._models import (
+    SWAP,
+    Components,
+    Coordinate,
+    FloquetModel,
+    Flow,
+    ForcedModel,
+    LinearPeriodic,
+    Rows,
+    Series,
+    Smoothness,
+)
+
+# Clock of the reduced equations, and predicted numbers of steps in this clock.
+
+
+def clock_basis(psi: Any) -> tuple[Array, Array]:
+    """``cos 2 psi`` and ``sin 2 psi``, the only functions of the clock psi in the reduced equations."""
+    return jnp.cos(2 * psi), jnp.sin(2 * psi)
+
+
+def clock(cos2psi: Any, sin2psi: Any, beta: Any) -> tuple[Any, Any, Any, Any]:
+    """``eta``, ``w = dtau/dpsi``, ``deta/dpsi`` and ``d(ln w)/dpsi`` in the clock psi, eqs (11)-(12).
+
+    Two Landen steps lead from tau to psi. The first, tan(chi) = sqrt(cos beta) tan(tau), distributes the poles of eta near
+    pi/2 to 0 and pi/2. The second, tan(2 chi) = kappa tan(2 psi) with kappa^2 = 1 - r^2 and r = tan(beta/2)^2, moves these
+    poles away from the axis.
+    """
+    c, r = jnp.cos(beta), jnp.tan(beta / 2) ** 2
+    # 1 - r = 2 c/(1 + c) and 1 -+ r cos(2 chi) are sums of positive terms here, without cancellation near beta = pi/2.
+    one_minus_r = 2 * c / (1 + c)
+    kappa2 = one_minus_r * (1 + r)
+    root = jnp.sqrt(cos2psi**2 + kappa2 * sin2psi**2)
+    # root (1 + |cos 2chi|) and root (1 - |cos 2chi|), then root (1 - r cos 2chi) and root (1 + r cos 2chi).
+    large = root + jnp.abs(cos2psi)
+    small = kappa2 * sin2psi**2 / large
+    first_half = cos2psi > 0
+    minus = one_minus_r * root + r * jnp.where(first_half, small, large)
+    plus = one_minus_r * root + r * jnp.where(first_half, large, small)
+    # A single division for eta = minus/plus, w = dtau/dpsi and deta/dpsi.
+    inverse = 1 / (minus * plus * root)
+    inverse_plus = minus * root * inverse
+    eta = minus * inverse_plus
+    w = 2 * jnp.sqrt(c * kappa2) / (1 + c) * plus * inverse
+    # w is a constant over minus and root, minus = root - r cos 2psi, and 1 - kappa^2 = r^2.
+    turn = -2 * r * sin2psi * minus * (minus * plus * inverse) ** 2
+    return eta, w, 4 * r * kappa2 * sin2psi * inverse_plus * minus * inverse, turn
+
+
+def panels_needed(xp: Any, phase: Any, sharpness: Any, decay: Any, digits: float) -> Any:
+    """Panels of Gauss collocation over half a period; fitted, see ``Cardan.panels``."""
+    x, y, z = xp.log(xp.maximum(phase, 1.0)), sharpness, xp.log(xp.maximum(decay, 1.0))
+    light = 0.78 + 0.315 * x + 0.136 * x**2 + (0.5 - 0.128 * x + 0.022 * digits) * y + 0.2 * digits
+    heavy = 1.08 + (0.278 + 0.062 * x) * x + 0.413 * y + (0.201 + 0.02 * z - 0.051 * y - 0.062 * x) * z + 0.182 * digits
+    return xp.exp(xp.where(decay > 3, heavy, light))
+
+
+# Physical data of a cardan shaft and the parameters of ``cardan``, eq. (7) of docs/theory/cardan.md.
+
+
+def _alpha(c2: Any, c1: Any) -> Any:
+    xp, c2, c1 = numeric(c2, c1)
+    # Without damping of the driving shaft the ratio has no meaning. A traced value cannot be checked.
+    if xp is np and np.any((c1 == 0) & (c2 != 0)):
+        raise InputError(f"c2 = {c2.tolist()!r}: allowed is 0 if c1 = 0 (alpha = c2/c1)")
+    return xp.divide(c2, xp.where(c1 == 0, 1.0, c1))
+
+
+def _radians(angle: Any) -> Any:
+    xp, angle = numeric(angle)
+    return xp.radians(angle)
+
+
+def _frequency(j1: Any, k1: Any) -> Any:
+    xp, j1, k1 = numeric(j1, k1)
+    return xp.sqrt(k1 / j1)
+
+
+def _unit_of_damping(j1: Any, k1: Any) -> Any:
+    xp, j1, k1 = numeric(j1, k1)
+    # Square roots one by one, because in some units the product overflows.
+    return 2 * xp.sqrt(k1) * xp.sqrt(j1)
+
+
+PHYSICAL = PhysicalData(
+    (
+        Parameter("J1", "kg m2", "inertia of the driving disk", **POSITIVE),
+        Parameter("J2", "kg m2", "inertia of the driven disk", **POSITIVE),
+        Parameter("k1", "N m/rad", "stiffness of the driving shaft", **POSITIVE),
+        Parameter("k2", "N m/rad", "stiffness of the driven shaft", **POSITIVE),
+        Parameter("c1", "N m s/rad", "damping of the driving shaft", lower=0.0),
+        Parameter("c2", "N m s/rad", "damping of the driven shaft", lower=0.0),
+        Parameter("speed", "rpm", "speed of the driving shaft", **POSITIVE),
+        Parameter("angle", "deg", "joint angle", lower=-90.0, upper=90.0, open_lower=True, open_upper=True),
+    ),
+    (
+        Conversion("beta", ("angle",), _radians, "angle", np.degrees),
+        Conversion(
+            "Omega",
+            ("speed", "J1", "k1"),
+            lambda speed, j1, k1: speed * RPM / _frequency(j1, k1),
+            "speed sqrt(J1/k1)",
+            lambda omega, j1, k1: omega * _frequency(j1, k1) / RPM,
+        ),
+        Conversion(
+            "zeta",
+            ("c1", "J1", "k1"),
+            lambda c1, j1, k1: c1 / _unit_of_damping(j1, k1),
+            "c1/(2 sqrt(k1 J1))",
+            lambda zeta, j1, k1: zeta * _unit_of_damping(j1, k1),
+        ),
+        Conversion("alpha", ("c2", "c1"), _alpha, "c2/c1"),
+        Conversion("mu", ("k2", "k1"), lambda k2, k1: k2 / k1, "k2/k1", lambda mu, k1: mu * k1),
+        Conversion("gamma", ("J2", "J1"), lambda j2, j1: j2 / j1, "J2/J1", lambda gamma, j1: gamma * j1),
+    ),
+)
+
 
 OPEN = {"open_lower": True, "open_upper": True}
-POSITIVE = {"lower": 0.0, "open_lower": True}
 # Decay over half a period beyond which slow modes lose digits in absolute coordinates.
 _STRONG = 10.0
 
@@ -95,7 +216,7 @@ class Cardan(System):
     title = "Cardan (Hooke-joint) shaft"
     source = "Soltan Rezaee & Ghazavi, Modares Mechanical Engineering 14(12), 2014, 163-170"
     presets = PRESETS
-    resonances = RESONANCES
+    resonances = CARDAN
     physical = PHYSICAL
     roles = MappingProxyType({"speed": "Omega", "angle": "beta", "damping": "zeta"})
     state = (

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from drivetrain_jax.resonances.orders import FREQUENCIES, Orders, in_hertz, operating_range
+from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range
 from drivetrain_jax.view import cells
 from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS

@@ -7,7 +7,7 @@ import pytest
 
 from drivetrain_jax.atlas import Domain, Quantity, construct, from_arrays, run, to_arrays, values_at
 from drivetrain_jax.systems import Coordinate
-from drivetrain_jax.systems._smooth import identity
+from drivetrain_jax.systems._models import identity
 
 TOLERANCE = 1e-10
 SQUARE = Domain(("x", "y"), (-1.0, 0.5), (2.0, 3.0), (identity("x"), identity("y")), {})

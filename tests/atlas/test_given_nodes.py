@@ -17,7 +17,7 @@ from drivetrain_jax.atlas import series as series_module
 from drivetrain_jax.atlas.floquet import floquet_domain
 from drivetrain_jax.atlas.series import series_nodes
 from drivetrain_jax.systems import Coordinate, Series, Smoothness
-from drivetrain_jax.systems._smooth import identity
+from drivetrain_jax.systems._models import identity
 from tests.oracles.atlas_direct import BASE, CARDAN, cardan_atlas, direct_radius, random_points
 
 TOLERANCE = 1e-9

@@ -9,7 +9,7 @@ import pytest
 
 from drivetrain_jax.atlas import tips as naming
 from drivetrain_jax.atlas.boundaries import boundaries
-from drivetrain_jax.resonances.cardan import natural_frequencies
+from drivetrain_jax.resonances import natural_frequencies
 from tests.oracles.atlas_direct import BASE, CARDAN, cardan_atlas, monodromy, propagators
 
 BETA = np.pi / 6

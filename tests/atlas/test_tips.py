@@ -15,7 +15,7 @@ from drivetrain_jax.atlas.growth import growth
 from drivetrain_jax.atlas.patches import patches_of
 from drivetrain_jax.atlas.roots import on_line, roots
 from drivetrain_jax.atlas.tips import find_tips
-from drivetrain_jax.resonances.cardan import natural_frequencies
+from drivetrain_jax.resonances import natural_frequencies
 from drivetrain_jax.runs.atlas_answers import radius_gradient
 from tests.oracles.atlas_direct import BASE, CARDAN, cardan_atlas, monodromy, propagators
 from tests.oracles.cardan_reference import monodromy as reference_monodromy

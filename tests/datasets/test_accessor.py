@@ -16,7 +16,7 @@ import xarray as xr
 
 import drivetrain_jax as dt
 from drivetrain_jax.datasets import figure as figures
-from drivetrain_jax.datasets.resonances import BUILT_IN
+from drivetrain_jax.resonances import BUILT_IN
 from drivetrain_jax.systems import get_system, system_names
 from drivetrain_jax.view.style import caption
 from tests.atlases import atlas_file

@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import newton
 
-from drivetrain_jax.resonances.cardan import natural_frequencies
+from drivetrain_jax.resonances import natural_frequencies
 from drivetrain_jax.systems import get_system, tripod
 
 pytestmark = pytest.mark.docs

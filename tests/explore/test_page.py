@@ -82,11 +82,11 @@ def corners():
 @pytest.mark.full
 @needs_node
 def test_resonances_are_those_of_the_system(atlases, two, tmp_path):
-    from drivetrain_jax.resonances.cardan import RESONANCES
+    from drivetrain_jax.resonances import CARDAN
 
     (tmp_path / "four.html").write_text(atlases("four").explore().text)
     for page, mu in ((two, 1.0), (tmp_path / "four.html", 1.2)):
-        expected = dict(zip(RESONANCES.labels, RESONANCES.values({"mu": mu, "gamma": 100.0}), strict=True))
+        expected = dict(zip(CARDAN.labels, CARDAN.values({"mu": mu, "gamma": 100.0}), strict=True))
         told = texts(page, f"mu={mu}")["resonances"]
         assert len(told) == 15 and {x["label"]: x["value"] for x in told} == pytest.approx(
             {x["label"]: expected[x["label"]] for x in told}, rel=1e-9

@@ -21,7 +21,7 @@ from drivetrain_jax.runs.atlas_answers import _from_one
 from drivetrain_jax.runs.atlas_chart import chart
 from drivetrain_jax.runs.atlas_file import StoredAtlas
 from drivetrain_jax.systems import get_system
-from drivetrain_jax.systems.cardan_units import PHYSICAL
+from drivetrain_jax.systems.cardan import PHYSICAL
 from tests.atlases import atlas_file, stored_atlas
 from tests.sizes import full_after
 

@@ -13,7 +13,7 @@ from mpmath import mp
 from scipy.integrate import quad
 
 from drivetrain_jax.analysis.floquet import propagator
-from drivetrain_jax.resonances.cardan import natural_frequencies
+from drivetrain_jax.resonances import natural_frequencies
 from drivetrain_jax.systems import cardan, get_system, system_names
 
 SYSTEM = get_system("cardan")

@@ -9,8 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from drivetrain_jax import InputError
-from drivetrain_jax.systems.cardan import Cardan
-from drivetrain_jax.systems.cardan_units import PHYSICAL
+from drivetrain_jax.systems.cardan import PHYSICAL, Cardan
 from tests.oracles.cardan_reference import monodromy
 
 DATA = {"J1": 0.5, "J2": 3.0, "k1": 2e4, "k2": 5e3, "c1": 3.0, "c2": 1.5, "speed": 1500.0, "angle": 35.0}

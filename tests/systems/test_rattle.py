@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivetrain_jax.resonances.rattle import rattle_threshold
+from drivetrain_jax.resonances import rattle_threshold
 from drivetrain_jax.systems import get_system
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
 

@@ -12,7 +12,7 @@ from matplotlib.colors import to_hex
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis.modes.figure import type_colours
 from drivetrain_jax.analysis.modes.planetary_gear import displacements
-from drivetrain_jax.systems._planetary_springs import coordinate_names
+from drivetrain_jax.systems.planetary import coordinate_names
 from drivetrain_jax.view import plot
 
 TYPES = ("rigid", "rotational", "translational", "planet", "coupled")

@@ -20,7 +20,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.resonances.orders import stored_orders
+from drivetrain_jax.resonances import stored_orders
 from drivetrain_jax.view import cells, interference
 from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import (

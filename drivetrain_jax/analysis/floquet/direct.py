@@ -25,7 +25,7 @@ from drivetrain_jax.analysis.numerics.staged import staged
 
 if TYPE_CHECKING:
     from drivetrain_jax.systems import LinearPeriodic
-    from drivetrain_jax.systems._rows import Rows
+    from drivetrain_jax.systems._models import Rows
 
 # Rounding of the entries of A, in units of the last place. A search for the worst points showed that half is too little.
 _ENTRIES = 16

@@ -32,7 +32,7 @@ from drivetrain_jax.analysis.modes.mode_types import (
 from drivetrain_jax.analysis.modes.tracking import follow
 from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lane_count, path_entry, with_path
 from drivetrain_jax.analysis.numerics.singular_values import EPS, Bidiagonal, bidiagonal_form, bidiagonal_values
-from drivetrain_jax.resonances.orders import operating_range
+from drivetrain_jax.resonances import operating_range
 from drivetrain_jax.systems import Block, Model, SpringSystem, System
 
 Build = Callable[[Mapping[str, Any]], SpringSystem]

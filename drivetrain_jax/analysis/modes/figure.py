@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.modes.planetary_gear import BODY_COLOURS, draw_gear
-from drivetrain_jax.resonances.orders import Orders, stored_orders
+from drivetrain_jax.resonances import Orders, stored_orders
 from drivetrain_jax.view import cells, interference
 from drivetrain_jax.view.figure_layout import Margins, Panels
 from drivetrain_jax.view.style import FRAME_GREY, STYLE, axis_label, in_brackets, scene_key, units_of, variable_label
