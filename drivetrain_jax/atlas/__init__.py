@@ -22,10 +22,9 @@ from drivetrain_jax.atlas.floquet import (
     solve_rtol,
     stability_atlas,
 )
-from drivetrain_jax.atlas.panels import Atlas, Gap, Panel
+from drivetrain_jax.atlas.panels import Atlas, Gap, Panel, from_arrays, to_arrays
 from drivetrain_jax.atlas.quantity import Quantity
 from drivetrain_jax.atlas.stability import StabilityAtlas
-from drivetrain_jax.atlas.storage import from_arrays, to_arrays
 
 __all__ = [
     "Atlas",

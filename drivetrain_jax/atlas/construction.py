@@ -25,10 +25,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivetrain_jax.atlas.box import TROUBLED_DEPTH, Box, BoxRefinement, NodeSource, Refinement, Settings
-from drivetrain_jax.atlas.fitting import fit
-from drivetrain_jax.atlas.given_nodes import fit_given
-from drivetrain_jax.atlas.lines import probe
+from drivetrain_jax.atlas.fitting import (
+    TROUBLED_DEPTH,
+    Box,
+    BoxRefinement,
+    NodeSource,
+    Refinement,
+    Settings,
+    fit,
+    fit_given,
+    probe,
+)
 from drivetrain_jax.atlas.panels import Atlas, Gap, Panel, inside
 from drivetrain_jax.atlas.quantity import Quantity
 from drivetrain_jax.systems import Coordinate

@@ -2,8 +2,8 @@
 
 Most cells of a grid and most points are decided in closed form (``charts``, ``points``). If the bound is too wide or gives
 no verdict, the eigenvalues of Z decide, and the test of Schur and Cohn where the interval of rho contains 1. Without
-damping the verdict is that of ``conservative``. All other results, and all results of systems without a closed form, come
-from the eigenvalues.
+damping the verdict is :func:`~drivetrain_jax.atlas.charts.verdict`. All other results, and all results of systems without
+a closed form, come from the eigenvalues.
 """
 
 from __future__ import annotations
@@ -24,11 +24,10 @@ from drivetrain_jax.analysis.floquet import quartic
 from drivetrain_jax.analysis.floquet.results import VARIABLES
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
 from drivetrain_jax.atlas import charts, evaluation
-from drivetrain_jax.atlas.expansion import Expansion
-from drivetrain_jax.atlas.floquet_quantity import Build, results_of_propagator
+from drivetrain_jax.atlas.evaluation import Tile, tiles
 from drivetrain_jax.atlas.panels import Atlas
-from drivetrain_jax.atlas.points import LANES, evaluated_cells, point_kernel
-from drivetrain_jax.atlas.tiles import Tile, tiles
+from drivetrain_jax.atlas.points import LANES, Expansion, evaluated_cells, point_kernel
+from drivetrain_jax.atlas.quantity import Build, results_of_propagator
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
 DEFAULT_OUTPUTS = ("spectral_radius", "spectral_radius_error", "verdict")

@@ -14,8 +14,7 @@ from drivetrain_jax.atlas.criteria import Criteria, parameters_at
 from drivetrain_jax.atlas.exclusion import critical_points
 from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
 from drivetrain_jax.atlas.panels import Atlas, Gap, Panel, chebyshev, position_between
-from drivetrain_jax.atlas.patches import Patches, patches_of
-from drivetrain_jax.atlas.roots import merge, on_line, roots
+from drivetrain_jax.atlas.patches import Patches, merge, on_line, patches_of, roots
 from drivetrain_jax.atlas.tips import polish, suspected
 from drivetrain_jax.systems import System
 

@@ -1,4 +1,4 @@
-// An atlas as a function: panels, points, slices. Python: atlas/panels.py, atlas/stability.py, atlas/floquet_quantity.py.
+// An atlas as a function: panels, points, slices. Python: atlas/panels.py, atlas/stability.py, atlas/quantity.py.
 import { EPS, characteristic, eigenvalues, product, radiusBound } from "./linear.js";
 import { conservativeVerdict, invariants, nothingCrosses, radius } from "./quartic.js";
 

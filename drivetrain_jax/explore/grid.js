@@ -1,4 +1,4 @@
-// A slice of an atlas on a grid. As in Python (atlas/tiles.py, atlas/charts.py), the coefficients e1, e2, e3 of the
+// A slice of an atlas on a grid. As in Python (atlas/evaluation.py, atlas/charts.py), the coefficients e1, e2, e3 of the
 // characteristic polynomial are computed at Chebyshev nodes of small boxes, and interpolated from there to the cells.
 import {
   GAP, STABLE, UNDECIDED, UNSTABLE, atPoint, between, chebyshev, combine, determinantError, isHamiltonian, judge,

@@ -12,8 +12,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.atlas.interpolation import coefficients, evaluate, tensor_nodes
-from drivetrain_jax.atlas.panels import Atlas, Panel
-from drivetrain_jax.atlas.storage import to_arrays
+from drivetrain_jax.atlas.panels import Atlas, Panel, to_arrays
 from drivetrain_jax.systems import Coordinate, FloquetModel, System
 
 if TYPE_CHECKING:

@@ -1,5 +1,5 @@
 // Spectral radius of four multipliers in closed form, with Smith's discs as bound: analysis/floquet/quartic.py and
-// atlas/conservative.py, one point at a time. A point is [[A, B], [C, D]] = Phi, its 16 entries by rows.
+// atlas/charts.py, one point at a time. A point is [[A, B], [C, D]] = Phi, its 16 entries by rows.
 
 import { EPS } from "./linear.js";
 

@@ -23,7 +23,7 @@ from benchmarks.atlas_attack import (
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.floquet import quartic
 from drivetrain_jax.analysis.floquet.results import VARIABLES
-from drivetrain_jax.atlas import charts, tiles
+from drivetrain_jax.atlas import charts, evaluation
 from drivetrain_jax.atlas.panels import Atlas, Panel
 from tests.oracles.atlas_direct import BASE, cardan_atlas, direct_radius, random_points
 
@@ -78,7 +78,7 @@ def dense_axes(atlas, count):
     """Axes of rows far apart and ``count`` columns, and the fraction of the columns in tiles with nodes."""
     axes = [np.array([0.05, 0.7, 1.1, 1.499]), np.linspace(0.3, 2.0, count)]
     coordinates = [np.sort(c.forward(axis)) for c, axis in zip(atlas.atlas.coordinates, axes, strict=True)]
-    cut = list(tiles.tiles(atlas.atlas, coordinates, (8, min(512, count))))
+    cut = list(evaluation.tiles(atlas.atlas, coordinates, (8, min(512, count))))
     return axes, sum(len(tile.index[1]) for tile in cut if tile.spread is not None) / count
 
 
@@ -86,7 +86,7 @@ def dense_axes(atlas, count):
 def test_tiles_cover_each_column_once_and_are_few(chart, count, most):
     """Tiles are narrower where even widths would leave 34 or 51 columns to a last tile, which costs as much as any other."""
     coordinates = [np.sort(c.forward(x)) for c, x in zip(chart.atlas.coordinates, ([1.0], speeds(count)), strict=True)]
-    cut = list(tiles.tiles(chart.atlas, coordinates, (64, 512)))
+    cut = list(evaluation.tiles(chart.atlas, coordinates, (64, 512)))
     widths = {(tile.columns if tile.spread is None else tile.spread).shape[1] for tile in cut}
     assert np.array_equal(np.sort(np.concatenate([tile.index[1] for tile in cut])), np.arange(count))
     assert len(cut) <= most and len(widths) == 1 and max(widths) <= 512
@@ -104,7 +104,7 @@ def test_a_cell_on_a_common_face_has_the_panel_of_a_point():
     atlas = Atlas(("a", "b"), (None, None), np.zeros(2), np.ones(2), {}, panels, (), 1e-9, 0)
     axes = [np.linspace(0.0, 1.0, 5)] * 2
     left = np.full((5, 5), -1)
-    for tile in tiles.tiles(atlas, axes, (64, 512)):
+    for tile in evaluation.tiles(atlas, axes, (64, 512)):
         left[np.ix_(*tile.index)] = next(k for k, panel in enumerate(panels) if panel is tile.panel)
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     assert left.tolist() == atlas.find(points.reshape(-1, 2)).reshape(5, 5).tolist()
@@ -150,7 +150,7 @@ def test_dense_columns_are_interpolated_within_their_bounds(chart):
 
 def test_too_few_nodes_are_noticed(chart, monkeypatch):
     """The truncation error of the nodes is measured, and cells with a large one are computed again."""
-    monkeypatch.setattr(tiles, "_SPAN", 200.0)
+    monkeypatch.setattr(evaluation, "_SPAN", 200.0)
     axes, dense = dense_axes(chart, 400)
     assert dense == 1.0
     found = chart.on_grid(axes)

@@ -9,7 +9,7 @@ import pytest
 
 from drivetrain_jax.analysis.floquet import quartic
 from drivetrain_jax.analysis.floquet.results import VARIABLES
-from drivetrain_jax.atlas import StabilityAtlas, expansion
+from drivetrain_jax.atlas import StabilityAtlas, points
 from drivetrain_jax.atlas.criteria import invariants, monodromy
 from tests.oracles.atlas_direct import direct_radius, random_points
 
@@ -48,10 +48,10 @@ def test_bounds_include_the_error_of_a_panel(chart, coarse, way):
 
 def test_bounds_include_the_truncation_error_of_an_expansion(chart, monkeypatch):
     """Each box has fewer polynomials than needed."""
-    monkeypatch.setattr(expansion, "_PART", 1e4)
+    monkeypatch.setattr(points, "_PART", 1e4)
     poor = StabilityAtlas(chart.atlas, chart.build, chart.rtol)
-    points = random_points(chart, 300, seed=3)
-    found, (radius, _) = poor.at(points), direct_radius(chart, points)
+    drawn = random_points(chart, 300, seed=3)
+    found, (radius, _) = poor.at(drawn), direct_radius(chart, drawn)
     assert (np.abs(found["spectral_radius"] - radius) <= found["spectral_radius_error"] + 1e-13).all()
     assert np.median(found["spectral_radius_error"]) > 1e-8
 

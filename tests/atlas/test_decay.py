@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivetrain_jax.atlas.decay import foreseen, needed, remainder
+from drivetrain_jax.atlas.interpolation import foreseen, needed, remainder
 
 
 def test_a_tail_of_rounding_is_not_extrapolated():

@@ -13,9 +13,8 @@ from drivetrain_jax.analysis.floquet.effort import steps_needed
 from drivetrain_jax.analysis.floquet.power_series import propagators_along
 from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.atlas import Domain, Quantity, construct, run, values_at
-from drivetrain_jax.atlas import series as series_module
-from drivetrain_jax.atlas.floquet import floquet_domain
-from drivetrain_jax.atlas.series import series_nodes
+from drivetrain_jax.atlas import floquet as series_module
+from drivetrain_jax.atlas.floquet import floquet_domain, series_nodes
 from drivetrain_jax.systems import Coordinate, Series, Smoothness
 from drivetrain_jax.systems._models import identity
 from tests.oracles.atlas_direct import BASE, CARDAN, cardan_atlas, direct_radius, random_points

@@ -9,11 +9,9 @@ import pytest
 
 from drivetrain_jax.atlas import tips as naming
 from drivetrain_jax.atlas.boundaries import boundaries
-from drivetrain_jax.atlas.criteria import Criteria, invariants
+from drivetrain_jax.atlas.criteria import Criteria, growth, invariants
 from drivetrain_jax.atlas.exclusion import critical_points
-from drivetrain_jax.atlas.growth import growth
-from drivetrain_jax.atlas.patches import patches_of
-from drivetrain_jax.atlas.roots import on_line, roots
+from drivetrain_jax.atlas.patches import on_line, patches_of, roots
 from drivetrain_jax.atlas.tips import find_tips
 from drivetrain_jax.resonances import natural_frequencies
 from drivetrain_jax.runs.atlas_answers import radius_gradient

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivetrain_jax.atlas import boundaries, exclusion, tracing
+from drivetrain_jax.atlas import boundaries, exclusion
 from drivetrain_jax.atlas.patches import Patches, join
 
 
@@ -56,8 +56,8 @@ def test_the_error_includes_trimmed_coefficients():
 
 def test_a_curve_is_traced_both_ways_from_its_seed():
     """The seed is near the vertex of the parabola h = (2 v^2 - 1)/5, which ends at the rim."""
-    field = tracing.Field(one_patch([[0.0, 0.0, -0.2], [1.0, 0.0, 0.0]]))
-    (curve,) = tracing.trace(field, np.array([[-0.21, 0.0]]))
+    field = boundaries.Field(one_patch([[0.0, 0.0, -0.2], [1.0, 0.0, 0.0]]))
+    (curve,) = boundaries.trace(field, np.array([[-0.21, 0.0]]))
     h, v = curve.T
     assert h == pytest.approx((2 * v**2 - 1) / 5, abs=1e-12)
     assert np.abs(np.diff(curve, axis=0)).max() < 0.04 and (np.diff(v) > 0).all() == (v[0] < 0)
@@ -66,8 +66,8 @@ def test_a_curve_is_traced_both_ways_from_its_seed():
 
 def test_a_closed_curve_ends_where_it_began():
     """The seed is near the circle of radius 1/2."""
-    field = tracing.Field(one_patch([[0.75, 0.0, 0.5], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]))
-    (curve,) = tracing.trace(field, np.array([[0.51, 0.0]]))
+    field = boundaries.Field(one_patch([[0.75, 0.0, 0.5], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]))
+    (curve,) = boundaries.trace(field, np.array([[0.51, 0.0]]))
     assert np.array_equal(curve[0], curve[-1])
     assert np.linalg.norm(curve, axis=1) == pytest.approx(np.full(len(curve), 0.5), abs=1e-12)
     # The path goes around once.
@@ -76,7 +76,7 @@ def test_a_closed_curve_ends_where_it_began():
 
 def test_the_other_edge_of_a_narrow_tongue_is_another_curve():
     """The edges of h^2 = 1e-8 are nearer to each other than chords are to curves."""
-    field = tracing.Field(one_patch([[0.5 - 1e-8, 0.0], [0.0, 0.0], [0.5, 0.0]]))
+    field = boundaries.Field(one_patch([[0.5 - 1e-8, 0.0], [0.0, 0.0], [0.5, 0.0]]))
     v = np.linspace(-1.0, 1.0, 101)
     edge = np.stack([np.full(101, 1e-4), v], axis=-1)
     seeds = np.array([[1e-4, 0.013], [-1e-4, 0.013], [0.5, 0.013]])
@@ -92,14 +92,14 @@ def test_segments_leave_out_points_that_are_not_limiting():
 
 def test_a_path_ends_on_the_rim():
     """A straight path has both ends on the rim; on a bent one the last step is corrected along the rim."""
-    (curve,) = tracing.trace(tracing.Field(one_patch([[-0.3, 0.0], [1.0, 0.0]])), np.array([[0.3, 0.1]]))
+    (curve,) = boundaries.trace(boundaries.Field(one_patch([[-0.3, 0.0], [1.0, 0.0]])), np.array([[0.3, 0.1]]))
     assert sorted(curve[[0, -1], 1]) == [-1.0, 1.0]
 
     def field(y):
         slope = np.stack([np.ones(len(y)), -0.6 * (y[:, 1] - 1)], axis=-1)
         return y[:, 0] - 0.5 - 0.3 * (y[:, 1] - 1) ** 2, slope
 
-    end = tracing._to_rim(field, np.array([0.50003, 0.99]), np.array([0.50003, 1.01]))
+    end = boundaries._to_rim(field, np.array([0.50003, 0.99]), np.array([0.50003, 1.01]))
     assert end == pytest.approx([0.5, 1.0], abs=1e-12)
 
 
@@ -109,7 +109,7 @@ def test_a_path_along_the_rim_ends_there():
     def field(y):
         return np.zeros(len(y)), np.tile([1.0, 0.0], (len(y), 1))
 
-    end = tracing._to_rim(field, np.array([-1e-9, 0.5]), np.array([-1.0000001e-9, 0.51]))
+    end = boundaries._to_rim(field, np.array([-1e-9, 0.5]), np.array([-1.0000001e-9, 0.51]))
     assert end == pytest.approx([0.0, 0.5], abs=0.02)
 
 
@@ -123,8 +123,8 @@ def test_points_lie_on_the_edges_of_a_narrow_slanted_tongue(foot, width):
     analysis = np.linalg.inv(np.polynomial.chebyshev.chebvander(t, 7))
     h, v = np.meshgrid(t, t, indexing="ij")
     values = (h - 0.3 * v - 0.3 * v**2) ** 2 - width * (v - foot)
-    field = tracing.Field(one_patch(analysis @ values @ analysis.T))
-    (curve,) = tracing.trace_tips(field, np.array([[0.3 * foot + 0.3 * foot**2, foot]]), 0)
+    field = boundaries.Field(one_patch(analysis @ values @ analysis.T))
+    (curve,) = boundaries.trace_tips(field, np.array([[0.3 * foot + 0.3 * foot**2, foot]]), 0)
     value, gradient = field(field.to_unit(curve))
     h, v = curve.T
     top = np.argmin(np.abs(v - foot))
@@ -141,7 +141,7 @@ def test_turns_of_steps_are_limited():
     def field(y):
         return ((y - 0.5) ** 2).sum(axis=1) - radius**2, 2 * (y - 0.5)
 
-    (path,), returned = tracing._follow(field, np.array([[0.5 + radius, 0.5]]), np.ones(1))
+    (path,), returned = boundaries._follow(field, np.array([[0.5 + radius, 0.5]]), np.ones(1))
     assert returned.all() and 50 < len(path) < 100
     angle = np.unwrap(np.arctan2(path[:, 1] - 0.5, path[:, 0] - 0.5))
     assert abs(angle[-1] - angle[0]) == pytest.approx(2 * np.pi)
@@ -160,7 +160,7 @@ def test_a_large_correction_belongs_to_another_curve(shift, end):
     def field(y):
         return y[:, 0] - 0.5 - shift * (y[:, 1] > 0.6), np.tile([1.0, 0.0], (len(y), 1))
 
-    (path,), _ = tracing._follow(field, np.array([[0.5, 0.3]]), np.ones(1))
+    (path,), _ = boundaries._follow(field, np.array([[0.5, 0.3]]), np.ones(1))
     assert path[-1, 1] == pytest.approx(end, abs=1e-6)
 
 
@@ -173,6 +173,6 @@ def test_a_path_ends_where_the_function_is_undefined():
         known = np.where(y[:, 1] < 0.7, 1.0, np.nan)
         return (y[:, 0] - 0.5) * known, np.tile([1.0, 0.0], (len(y), 1)) * known[:, None]
 
-    (path,), returned = tracing._follow(field, np.array([[0.5, 0.3]]), np.ones(1))
+    (path,), returned = boundaries._follow(field, np.array([[0.5, 0.3]]), np.ones(1))
     assert path[-1] == pytest.approx([0.5, 0.7], abs=1e-6) and not returned.any()
     assert len(asked) < 400

@@ -14,8 +14,8 @@ from matplotlib.collections import LineCollection
 import drivetrain_jax as dt
 from drivetrain_jax.atlas import design, stability
 from drivetrain_jax.atlas.boundaries import boundaries
+from drivetrain_jax.atlas.evaluation import tiles
 from drivetrain_jax.atlas.exclusion import critical_points
-from drivetrain_jax.atlas.tiles import tiles
 from drivetrain_jax.runs import atlas_answers, rounds
 from drivetrain_jax.runs.atlas_answers import _from_one
 from drivetrain_jax.runs.atlas_chart import chart
