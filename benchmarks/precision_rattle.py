@@ -29,8 +29,7 @@ from benchmarks.precision_study import study
 from benchmarks.rattle_diffrax import integrate
 from benchmarks.timing import once
 from drivetrain_jax.analysis.frequency_response.harmonic_balance import Basis
-from drivetrain_jax.analysis.frequency_response.harmonic_response import describe
-from drivetrain_jax.analysis.frequency_response.harmonic_sweep import sweep
+from drivetrain_jax.analysis.frequency_response.harmonic_response import describe, sweep
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
 from tests.oracles.rattle_reference import extended, scipy_events, scipy_plain

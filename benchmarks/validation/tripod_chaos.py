@@ -12,7 +12,7 @@ import numpy as np
 
 import drivetrain_jax as dt
 from benchmarks.validation.document import markdown
-from drivetrain_jax.analysis.lyapunov.paper_estimator import paper_estimator
+from drivetrain_jax.analysis.lyapunov.section_measures import paper_estimator
 from drivetrain_jax.systems import Flow
 from tests.oracles.chaos_reference import scipy_spectrum, tripod_field
 

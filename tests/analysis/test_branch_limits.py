@@ -7,8 +7,8 @@ import pytest
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis._base import Request
 from drivetrain_jax.analysis.frequency_response import analysis as frequency_response
-from drivetrain_jax.analysis.frequency_response import harmonic_branch, harmonic_response
-from drivetrain_jax.analysis.impacts import exact_branch
+from drivetrain_jax.analysis.frequency_response import harmonic_response
+from drivetrain_jax.analysis.impacts import exact_response
 from drivetrain_jax.analysis.numerics import continuation
 from drivetrain_jax.analysis.numerics.branch_sections import distinct
 from drivetrain_jax.systems import rattle
@@ -33,7 +33,7 @@ def branch(method):
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("method", "module"),
-    [pytest.param("exact", exact_branch, marks=pytest.mark.full), ("harmonic_balance", harmonic_response)],
+    [pytest.param("exact", exact_response, marks=pytest.mark.full), ("harmonic_balance", harmonic_response)],
 )
 def test_more_motions_than_there_is_room_for(method, module, monkeypatch):
     monkeypatch.setattr(module, "BRANCHES", 2)
@@ -46,8 +46,8 @@ def test_more_motions_than_there_is_room_for(method, module, monkeypatch):
 @pytest.mark.parametrize(
     ("method", "module", "name"),
     [
-        pytest.param("exact", exact_branch, "_CORRECTIONS", marks=pytest.mark.full),
-        ("harmonic_balance", harmonic_branch, "_POLISH"),
+        pytest.param("exact", exact_response, "_CORRECTIONS", marks=pytest.mark.full),
+        ("harmonic_balance", harmonic_response, "_POLISH"),
     ],
 )
 def test_a_motion_that_cannot_be_corrected(method, module, name, monkeypatch):

@@ -15,10 +15,8 @@ from scipy.integrate import quad, solve_ivp
 from drivetrain_jax.analysis.frequency_response import (
     closed_form_response,
     describing_function,
-    equivalent_stiffness,
-    multiple_scales,
 )
-from drivetrain_jax.analysis.numerics.amplitude_roots import follow, refined
+from drivetrain_jax.analysis.numerics.branch_sections import follow, refined
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
 from tests.quick_jit import quick_jit
 from tests.sizes import full_after
@@ -82,7 +80,7 @@ def linear(values, omega):
 
 def test_cubic_is_the_least_squares_fit():
     model, reach = MODEL, 0.9
-    fit = multiple_scales.cubic_fit(model, jnp.array(reach))
+    fit = closed_form_response.cubic_fit(model, jnp.array(reach))
     powers = np.array([[2 * reach ** (i + j + 1) / (i + j + 1) for j in (1, 3)] for i in (1, 3)])
     moments = [
         2 * quad(lambda u, i=i: float(model.restoring(u)) * u**i, 0, reach, points=[model.b], epsabs=1e-13)[0]
@@ -92,11 +90,11 @@ def test_cubic_is_the_least_squares_fit():
 
 
 def test_multiple_scales_of_table_1():
-    fit = multiple_scales.cubic_fit(MODEL, jnp.array(1.0))
-    flow = multiple_scales.slow_flow(MODEL, fit)
+    fit = closed_form_response.cubic_fit(MODEL, jnp.array(1.0))
+    flow = closed_form_response.slow_flow(MODEL, fit)
     np.testing.assert_allclose([fit.stiffness, fit.cubic], [0.6441, 0.2692], atol=5e-5)
-    np.testing.assert_allclose(multiple_scales.peak(flow), [0.748, 0.8729], atol=5e-4)
-    np.testing.assert_allclose(multiple_scales.folds(flow)[1], [0.861, 0.8752], atol=3e-4)
+    np.testing.assert_allclose(closed_form_response.peak(flow), [0.748, 0.8729], atol=5e-4)
+    np.testing.assert_allclose(closed_form_response.folds(flow)[1], [0.861, 0.8752], atol=3e-4)
 
 
 @pytest.mark.parametrize("damping", [1e-8, 1e-11, 1e-14])
@@ -108,8 +106,8 @@ def test_multiple_scales_at_hardly_any_damping(damping):
     away = OMEGAS != 1.0
     expected = TABLE1["B1"] / 2 / np.abs(OMEGAS[away] - 1)
     np.testing.assert_allclose(low[away, 0], expected, rtol=1e-12)
-    flow = multiple_scales.SlowFlow(*(jnp.array(x) for x in (0.8, damping, 0.02, 0.13)))
-    rho, frequency = multiple_scales.folds(flow)
+    flow = closed_form_response.SlowFlow(*(jnp.array(x) for x in (0.8, damping, 0.02, 0.13)))
+    rho, frequency = closed_form_response.folds(flow)
     # Without damping F^2 = 4 g^2 rho^3 at the fold, on the arm omega = w0 + g rho + F/sqrt(rho); the other is the peak.
     assert rho[0] == pytest.approx((0.02**2 / (4 * 0.13**2)) ** (1 / 3), rel=1e-12)
     assert frequency[0] == pytest.approx(0.8 + 0.13 * float(rho[0]) + 0.02 / math.sqrt(rho[0]), rel=1e-12)
@@ -132,26 +130,28 @@ def test_folds_and_peak_are_at_frequencies_of_a_drive():
 def test_the_largest_self_consistent_range_is_taken(alpha):
     """The range agrees with a dense scan from large ranges down, also where two ranges nearly merge."""
     for ratio in (0.01, 0.4, 0.55, 0.65, 0.68, 0.69, 0.71, 0.72, 0.8, 0.9, 0.95):
-        stiffness = 1 - (1 - alpha) * float(multiple_scales._share(ratio))
+        stiffness = 1 - (1 - alpha) * float(closed_form_response._share(ratio))
         if stiffness <= 0:
             continue
         model = Rattle.models["basins"].build(
             TABLE1 | {"alpha": alpha, "B1": TABLE1["c"] * TABLE1["b"] / ratio * math.sqrt(stiffness)}
         )
-        reach = float(multiple_scales.self_consistent_range(model, ()))
+        reach = float(closed_form_response.self_consistent_range(model, ()))
         r = np.linspace(1e-3, 1, 400_000)
-        excess = (1 - (1 - alpha) * multiple_scales._share(r)) / r**2 - stiffness / ratio**2
+        excess = (1 - (1 - alpha) * closed_form_response._share(r)) / r**2 - stiffness / ratio**2
         assert TABLE1["b"] / reach == pytest.approx(r[np.argmax(excess <= 1e-12 / ratio**2)], rel=1e-2)
-        peak = multiple_scales.peak(
-            multiple_scales.slow_flow(model, multiple_scales.cubic_fit(model, jnp.array(reach)))
+        peak = closed_form_response.peak(
+            closed_form_response.slow_flow(model, closed_form_response.cubic_fit(model, jnp.array(reach)))
         )
         assert peak[0] == pytest.approx(reach, rel=1e-9)
 
 
 @pytest.mark.full
 def test_self_consistent_range_is_the_peak_it_gives(scales):
-    reach = multiple_scales.self_consistent_range(MODEL, ())
-    peak = multiple_scales.peak(multiple_scales.slow_flow(MODEL, multiple_scales.cubic_fit(MODEL, reach)))
+    reach = closed_form_response.self_consistent_range(MODEL, ())
+    peak = closed_form_response.peak(
+        closed_form_response.slow_flow(MODEL, closed_form_response.cubic_fit(MODEL, reach))
+    )
     assert reach == pytest.approx(0.80, abs=2e-3)
     assert peak[0] == pytest.approx(float(reach), rel=1e-12)
     assert scales["peak_amplitude"][0, 0] == pytest.approx(float(reach), rel=1e-12)
@@ -165,7 +165,7 @@ def test_one_parameter_may_vary_alone(name):
     cases = [table | {name: table[name] * factor} for factor in factors]
 
     def reach(values, shape):
-        return multiple_scales.self_consistent_range(Rattle.models["basins"].build(values), shape)
+        return closed_form_response.self_consistent_range(Rattle.models["basins"].build(values), shape)
 
     expected = jax.jit(lambda values: reach(values, (3,)))(lanes(cases))
     for chosen in (slice(1), slice(1, None), slice(None)):
@@ -195,8 +195,8 @@ def settled(epsilon: float, sigma: float, start: float) -> float:
 def test_cubic_system_meets_averaged_amplitudes_to_first_order():
     """Integration in time: errors halve with epsilon, and the middle amplitude separates the basins of the others."""
     sigma, errors = 0.55, []
-    flow = multiple_scales.SlowFlow(jnp.array(0.0), jnp.array(0.2), jnp.array(0.25), jnp.array(0.375))
-    low, middle, high = (float(a) for a in multiple_scales.roots(flow, jnp.array(sigma)))
+    flow = closed_form_response.SlowFlow(jnp.array(0.0), jnp.array(0.2), jnp.array(0.25), jnp.array(0.375))
+    low, middle, high = (float(a) for a in closed_form_response.roots(flow, jnp.array(sigma)))
     for epsilon in (0.04, 0.02):
         found = settled(epsilon, sigma, 0.85 * middle), settled(epsilon, sigma, 1.15 * middle)
         errors.append([found[0] - low, found[1] - high])
@@ -211,7 +211,7 @@ def test_describing_function_against_quadrature():
     angle = 2 * np.pi * (np.arange(200_000) + 0.5) / 200_000
     force = np.asarray(MODEL.restoring(bias + amplitude * np.cos(angle)))
     assert float(point.stiffness) == pytest.approx(2 * np.mean(force * np.cos(angle)) / amplitude, rel=1e-8)
-    mean = equivalent_stiffness.imbalance(MODEL, jnp.array(amplitude), jnp.array(bias))[0] + MODEL.B0 / MODEL.stiffness
+    mean = describing_function.imbalance(MODEL, jnp.array(amplitude), jnp.array(bias))[0] + MODEL.B0 / MODEL.stiffness
     assert float(mean) == pytest.approx(force.mean(), rel=1e-8)
     a = 0.4
     step = 1e-5

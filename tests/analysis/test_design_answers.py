@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import drivetrain_jax as dt
-from drivetrain_jax.analysis.critical_speeds.margins import required_margin
+from drivetrain_jax.analysis.critical_speeds.analysis import required_margin
 from drivetrain_jax.analysis.floquet.growth import growth
 from tests.oracles.bicardan_reference import finite_elements
 

@@ -13,9 +13,8 @@ import pytest
 from drivetrain_jax.analysis.frequency_response import harmonic_balance as hb
 from drivetrain_jax.analysis.frequency_response import harmonic_response
 from drivetrain_jax.analysis.frequency_response.closed_form_response import response as closed_form
-from drivetrain_jax.analysis.frequency_response.harmonic_branch import trace
-from drivetrain_jax.analysis.frequency_response.harmonic_stability import half_trace, spectral_radius
-from drivetrain_jax.analysis.frequency_response.harmonic_sweep import settle
+from drivetrain_jax.analysis.frequency_response.harmonic_balance import half_trace, spectral_radius
+from drivetrain_jax.analysis.frequency_response.harmonic_response import settle, trace
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
 from tests.quick_jit import quick_jit

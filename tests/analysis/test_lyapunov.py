@@ -14,10 +14,10 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import Outcome, Request
-from drivetrain_jax.analysis.lyapunov import sampling
+from drivetrain_jax.analysis.lyapunov import section_measures
 from drivetrain_jax.analysis.lyapunov.analysis import analyse
-from drivetrain_jax.analysis.lyapunov.forcing import may_be_chaotic
-from drivetrain_jax.analysis.lyapunov.march_steps import needed_steps
+from drivetrain_jax.analysis.lyapunov.orbit import may_be_chaotic
+from drivetrain_jax.analysis.lyapunov.variational import needed_steps
 from drivetrain_jax.analysis.lyapunov.verdict import Verdict
 from drivetrain_jax.invariants import check
 from drivetrain_jax.systems import Flow, get_system
@@ -100,8 +100,8 @@ def test_exponents_add_up_to_the_mean_divergence(name):
 
 def sampled_shortly(patch, strobes: int) -> None:
     """Take fewer strobes after a run, which cost more than a short run."""
-    patch.setattr(sampling, "SAMPLES", strobes)
-    patch.setattr(sampling, "LONGEST", strobes // 2)
+    patch.setattr(section_measures, "SAMPLES", strobes)
+    patch.setattr(section_measures, "LONGEST", strobes // 2)
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivetrain_jax.analysis.impacts.orbit_history import history
-from drivetrain_jax.analysis.impacts.piecewise_flow import piece, responses
-from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start, usual_steps
+from drivetrain_jax.analysis.impacts.orbit_measures import history
+from drivetrain_jax.analysis.impacts.piecewise_march import march, piece, prepare, responses, start, usual_steps
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
 from tests.oracles.rattle_reference import extended, random_case
 

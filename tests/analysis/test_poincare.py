@@ -11,8 +11,7 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.analysis.lyapunov.section_measures import period_multiple, torus_residual
-from drivetrain_jax.analysis.lyapunov.zero_one_test import chaos_k01
+from drivetrain_jax.analysis.lyapunov.section_measures import chaos_k01, period_multiple, torus_residual
 
 FIXED = {"element": "input", "beta": math.radians(9), "zeta": 0.0186, "chi_n": 0.0026}
 # 3000 Hz strobes against a motor torque of 300 Hz close after 10, 3066.5 Hz after 6133.

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivetrain_jax.analysis.modes.tracking import follow
+from drivetrain_jax.analysis.modes.mode_types import follow
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
 from drivetrain_jax.analysis.numerics.lanes import in_blocks
 from drivetrain_jax.analysis.numerics.linear_algebra import looped_matmul
@@ -19,9 +19,9 @@ from drivetrain_jax.analysis.numerics.singular_values import (
     _rotation,
     bidiagonal_form,
     bidiagonal_values,
+    jacobi_vectors,
     singular_values,
 )
-from drivetrain_jax.analysis.numerics.singular_vectors import jacobi_vectors
 from drivetrain_jax.systems import get_system
 from tests.oracles.planetary_reference import case_parameters
 

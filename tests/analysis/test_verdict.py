@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import pytest
 
-from drivetrain_jax.analysis.lyapunov.resolution import adds_up, same_exponent
+from drivetrain_jax.analysis.lyapunov.growth_record import adds_up, same_exponent
 from drivetrain_jax.analysis.lyapunov.verdict import Evidence, Verdict, judge
 
 CHAOTIC = Evidence(

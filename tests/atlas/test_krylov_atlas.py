@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.krylov_atlas import RANGES, TOLERANCE, determinant, domain, natural_frequencies, shaft, total_length
+from drivetrain_jax.analysis.critical_speeds.frequency_roots import determinant as plain_determinant
 from drivetrain_jax.analysis.critical_speeds.frequency_roots import find_roots
-from drivetrain_jax.analysis.critical_speeds.krylov import determinant as plain_determinant
 from drivetrain_jax.atlas import Quantity, construct, run, values_at
 
 SHORT = {**RANGES, "phase": (1.0, 14.0)}

@@ -33,13 +33,44 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.critical_speeds import frequency_roots as shaft_roots
-from drivetrain_jax.analysis.critical_speeds import krylov as shaft_krylov
 from drivetrain_jax.analysis.critical_speeds.frequency_roots import Roots, frequency_derivatives
-from drivetrain_jax.analysis.critical_speeds.margins import required_margin, separation_margin
 from drivetrain_jax.analysis.critical_speeds.mechanisms import is_undefined, mechanism_shapes, zero_modes
 from drivetrain_jax.analysis.critical_speeds.shapes import mode_shapes, normalised
 from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.systems import Shaft, System
+
+# Separation margins of critical speeds against a range of operating speeds: actual, and required by API 617.
+
+
+# Amplification factor below which a critical speed counts as critically damped (API 617, API 684).
+_DAMPED = 2.5
+# Factor of the formula, largest margin of a speed below the range, and the addition for a speed above it.
+_FACTOR, _LARGEST, _ABOVE = 0.17, 0.16, 0.1
+
+
+def separation_margin(speed: Any, lowest: float, highest: float) -> Array:
+    """Distance of ``speed`` from the operating range [lowest, highest] over its nearer end; 0 within.
+
+    A critical speed below gives ``(lowest - n)/lowest``, one above ``(n - highest)/highest`` (as in API 617).
+    """
+    speed = jnp.asarray(speed, float)
+    below = (lowest - speed) / (lowest if lowest > 0 else 1.0)
+    return jnp.maximum(jnp.maximum(below, (speed - highest) / highest), 0.0)
+
+
+def required_margin(speed: Any, lowest: float, amplification: Any) -> Array:
+    """The margin that API 617 requires of a critical ``speed`` with this ``amplification`` factor AF.
+
+    ``17 (1 - 1/(AF - 1.5))`` percent, at most 16, below the operating range; 10 more within and above it; none for AF < 2.5.
+    Models of this package have no damping; a factor comes from a measurement or a damped model.
+
+    >>> print(required_margin([1000.0, 9000.0], lowest=3000.0, amplification=10.0))
+    [0.15 0.25]
+    """
+    factor, above = jnp.asarray(amplification, float), jnp.asarray(speed, float) >= lowest
+    below = jnp.minimum(_FACTOR * (1 - 1 / jnp.maximum(factor - 1.5, 1.0)), _LARGEST)
+    return jnp.where(factor < _DAMPED, 0.0, below + jnp.where(above, _ABOVE, 0.0))
+
 
 VARIABLES = (
     Variable("natural_frequency", "Hz", "natural frequency", ("mode",)),
@@ -130,7 +161,7 @@ def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Ar
     del effort
     shaft, options = build(values), request.options
     certified = request.method == "certified"
-    roots = (shaft_roots if certified else shaft_krylov).find_roots(shaft, options["modes"])
+    roots = (shaft_roots.find_roots if certified else shaft_roots.krylov_roots)(shaft, options["modes"])
     p = roots.q**2
     finite = jnp.all(jnp.isfinite(shaft.length) & jnp.isfinite(shaft.EI) & jnp.isfinite(shaft.rhoA), axis=0)
     finite = finite & ~is_undefined(shaft)

@@ -32,8 +32,17 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax.analysis.critical_speeds.segments import LastNode, Segment, segments_of
-from drivetrain_jax.analysis.critical_speeds.waves import Compound, General, Plane, compound, general, sign_of
+from drivetrain_jax.analysis.critical_speeds.segments import (
+    Compound,
+    General,
+    LastNode,
+    Plane,
+    Segment,
+    compound,
+    general,
+    segments_of,
+    sign_of,
+)
 from drivetrain_jax.systems import Shaft
 
 # Halvings of a Timoshenko segment: enough for a million half waves.

@@ -10,21 +10,305 @@ also where the product has lost a part that hardly moves, or is at rest.
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.critical_speeds.compound import planes
-from drivetrain_jax.analysis.critical_speeds.eigenspace import states_in_clusters
-from drivetrain_jax.analysis.critical_speeds.links import Links, Segments, across_joints, along_segments
-from drivetrain_jax.analysis.critical_speeds.segments import Scales
-from drivetrain_jax.analysis.critical_speeds.waves import Plane, even_and_odd
-from drivetrain_jax.analysis.numerics.linear_algebra import matmul
+from drivetrain_jax.analysis.critical_speeds.compound import hinge_shares, planes, rotation_shares, support_shares
+from drivetrain_jax.analysis.critical_speeds.segments import Plane, Scales, Waves, between, even_and_odd, split_inertia
+from drivetrain_jax.analysis.numerics.linear_algebra import looped_matmul, matmul, solve
+from drivetrain_jax.analysis.numerics.singular_values import jacobi_vectors
 from drivetrain_jax.systems import Shaft
+
+# Linear forms of the state that are the same at both ends of a segment and on both sides of a joint.
+
+
+class Segments(NamedTuple):
+    """The waves of all segments at the frequencies of the modes, ``(n, modes, ...)``.
+
+    With the rotation ``(cosine, sine)`` the state falls into two pairs with ``alpha' = beta``, ``beta' = r^2 alpha``:
+    ``alpha = sine F - cosine theta``, ``beta = sine f - cosine M`` with ``r^2 = -trigonometric2``, and ``alpha = sine
+    theta + cosine F``, ``beta = cosine f + sine M`` with ``r^2 = hyperbolic2``. ``z`` is the phase of a whole segment. A
+    segment without mass (``massless``) has no waves: its deflection is a cubic, with the ``shear`` number.
+    """
+
+    z: Array
+    cosine: Array
+    sine: Array
+    trigonometric2: Array
+    hyperbolic2: Array
+    shear: Array
+    massless: Array
+
+    @classmethod
+    def of(cls, shaft: Shaft, q: Array) -> Segments:
+        """Of the segments of ``shaft`` at ``q = sqrt(p)``."""
+        scales = Scales.of(shaft)
+        square = (q * scales.b[:, None]) ** 2
+        none = jnp.zeros_like(square)
+        s = none if shaft.kGA is None else square * (shaft.EI / shaft.kGA)[:, None]
+        massless = shaft.rhoA == 0
+        t = none if shaft.rhoI is None else square * (shaft.rhoI / jnp.where(massless, 1.0, shaft.rhoA))[:, None]
+        half = (s - t) / 2
+        root = jnp.sqrt(half * half + 1)
+        ratio = jnp.where(half > 0, half + root, 1 / (root - half))
+        size = jnp.sqrt(1 + ratio * ratio)
+        waves = Waves.of(s, t)
+        z, pair = q * scales.beta[:, None], (waves.trigonometric2, waves.hyperbolic2)
+        return cls(z, 1 / size, ratio / size, *pair, s, massless[:, None])
+
+    def split(self, v: Array) -> tuple[Array, Array, Array, Array]:
+        """alpha and beta of the trigonometric and of the hyperbolic pair."""
+        f, theta, moment, force = v
+        c, s = self.cosine, self.sine
+        return s * force - c * theta, s * f - c * moment, s * theta + c * force, c * f + s * moment
+
+    @property
+    def number(self) -> Array:
+        """The real wave number of the hyperbolic pair, 0 above the cut-off."""
+        return jnp.sqrt(jnp.maximum(self.hyperbolic2, 0.0))
+
+    @property
+    def long(self) -> Array:
+        """True if the hyperbolic pair is treated as a falling and a rising wave."""
+        return self.number * self.z > 1
+
+    def cubic(self, xi: Array) -> tuple[Array, Array, Array, Array]:
+        """Deflection at the phase ``xi`` of a segment without mass, as a form of the state in front of it."""
+        half = 0.5 * xi * xi
+        return jnp.ones_like(half), xi, half, xi * (half / 3 - self.shear)
+
+
+class Links(NamedTuple):
+    """Four linear forms of the state that are the same at two sections, the state being ``v`` at the first of them and
+    ``w`` at the second: ``before @ v = behind @ w``, arrays ``(n, 4, 4, modes, ...)``.
+
+    Nothing in them is large, so that their values are known to rounding of ``v``: where a part cannot be told from
+    ``v``, such as a wave that grows or the force behind a rigid support, the form vanishes at the second section.
+    """
+
+    before: Array
+    behind: Array
+
+
+def along_segments(w: Segments) -> Links:
+    """From the start of every segment to its end, for either direction."""
+    o, c, s = jnp.zeros_like(w.cosine), w.cosine, w.sine
+    alpha, beta, alpha_h, beta_h = (
+        jnp.stack(form, axis=1) for form in ((o, -c, o, s), (s, o, -c, o), (o, s, o, c), (c, o, s, o))
+    )
+    w, long = Segments(*(field[:, None] for field in w)), w.long[:, None]
+    cos, sin, _ = even_and_odd(-w.trigonometric2, w.z)
+    ch, sh, growth = even_and_odd(w.hyperbolic2, w.z)
+    unit, nu = jnp.exp(-growth), jnp.sqrt(w.trigonometric2)
+    size = jnp.sqrt(jnp.maximum(jnp.abs(w.hyperbolic2), 1.0))
+    falling, rising = beta_h - w.number * alpha_h, beta_h + w.number * alpha_h
+    before = (
+        cos * alpha + sin * beta,
+        (cos * beta - w.trigonometric2 * sin * alpha) / nu,
+        jnp.where(long, unit * falling, ch * alpha_h + sh * beta_h),
+        jnp.where(long, rising, (ch * beta_h + w.hyperbolic2 * sh * alpha_h) / size),
+    )
+    behind = (
+        alpha,
+        beta / nu,
+        jnp.where(long, falling, unit * alpha_h),
+        unit * jnp.where(long, rising, beta_h / size),
+    )
+    waves = Links(jnp.stack(before, axis=1), jnp.stack(behind, axis=1))
+    return jax.tree.map(partial(jnp.where, w.massless[:, None]), _without_mass(w), waves)
+
+
+def _without_mass(w: Segments) -> Links:
+    """The four components of the state behind a segment without mass, each over the sum of its coefficients."""
+    one, o = jnp.ones_like(w.z), jnp.zeros_like(w.z)
+    deflection = w.cubic(w.z)
+    rows = (deflection, (o, one, w.z, deflection[2]), (o, o, one, w.z), (o, o, o, one))
+    size = jnp.stack([sum(jnp.abs(x) for x in row) for row in rows], axis=1)
+    before = jnp.stack([jnp.concatenate(row, axis=1) for row in rows], axis=1)
+    own = jnp.eye(4).reshape(1, 4, 4, *(1,) * (w.z.ndim - 2))
+    return Links(before / size, own / size)
+
+
+def across_joints(shaft: Shaft, q: Array) -> Links:
+    """Across the joint, its inertias and the support in front of every segment; in front of the first one anything.
+
+    ``f`` passes. ``theta + M/k_hinge`` and ``F - k f`` become theta and F. The moment within the joint is ``M + kappa
+    theta`` in front and ``M - kappa theta`` behind it (kappa: that of the rotary inertia there). Each is multiplied by what
+    keeps it finite.
+    """
+    scales = Scales.of(shaft)
+
+    def last(x: Array) -> Array:
+        return jnp.concatenate([x[:1], x[:-1]])
+
+    def joints(x: Array) -> Array:
+        return jnp.concatenate([x[:1], x])[:, None]
+
+    b, e1, e2, e3 = (joints(between(x)) if shaft.segments > 1 else x[:, None] for x in scales[1:5])
+    masses = None if shaft.m is None else shaft.m[:-1, None]
+    keep, reaction = support_shares(shaft.k[:-1, None], masses, e3, q)
+    hold, turn = (
+        (1.0, 0.0) if shaft.k_hinge is None or shaft.segments == 1 else hinge_shares(joints(shaft.k_hinge), e1, q)
+    )
+    inertias = (None if x is None else x[: shaft.segments, None] for x in split_inertia(shaft))
+    (pass_1, kappa_1), (pass_2, kappa_2) = (
+        (1.0, 0.0) if x is None else rotation_shares(None, x, e1, q) for x in inertias
+    )
+
+    def forms(units: tuple[Array, ...], turn: Any, hold: Any, kappa: Any, reaction: Any) -> Array:
+        theta, moment, force = (unit[:, None] for unit in units)
+        rows = (
+            (1.0, 0.0, 0.0, 0.0),
+            (0.0, hold * (theta / b), turn * e2 / b * (moment / e2), 0.0),
+            (0.0, kappa * theta / e2, pass_1 * pass_2 * (moment / e2), 0.0),
+            (-reaction / e3, 0.0, 0.0, keep * (force / e3)),
+        )
+        entries = jnp.broadcast_arrays(*(jnp.asarray(x, float) for row in rows for x in row), keep)
+        return jnp.stack(entries[:-1], axis=1).reshape(len(keep), 4, 4, *keep.shape[1:])
+
+    units = scales.b, scales.e2, scales.e3
+    before = forms(
+        tuple(last(x) for x in units), turn * pass_1, hold * pass_1 + turn * kappa_1, pass_2 * kappa_1, reaction
+    )
+    return Links(before, forms(units, 0.0, hold * pass_1, -pass_1 * kappa_2, 0.0))
+
+
+# Modes of multiple and of almost equal frequencies: the eigenspace of all of them, and its directions.
+#
+# At a natural frequency the conditions ``A(q) x = 0`` on the states x at the ends of all segments have a solution. For
+# a cluster of frequencies the solutions are the smallest singular vectors X of A at one of them. With the left vectors
+# Y, which follow from X by the symplectic form, ``Y^T A' X`` is the mass matrix of the modes (times a number) and ``Y^T
+# A X`` their stiffness beside that frequency: the directions that diagonalise both are the modes, orthogonal in the
+# mass (Rayleigh & Ritz). In an exactly multiple frequency the stiffness is rounding and any orthogonal directions are
+# right: those are taken that differ most in their places, so that each moves one of the spans that hinges on rigid
+# supports separate.
+
+
+# Relative distance up to which q belong to a cluster: a double root of Psi is known to the root of rounding only.
+_CLOSE = 1e-7
+# Relative distance up to which q are equal, and the one by which places part them.
+_EQUAL, _PARTED = 1e-13, 1e-14
+# The symplectic form of the states (f, theta, M, F).
+_FORM = np.array([[0, 0, 0, -1.0], [0, 0, 1, 0], [0, -1, 0, 0], [1, 0, 0, 0]])
+
+
+def states_in_clusters(shaft: Shaft, q: Array, states: Array) -> Array:
+    """``states`` at the ends of segments, ``(2n, 4, modes, *lanes)``, with those of the eigenspace where ``q`` is in a
+    cluster."""
+    modes, lanes = q.shape[0], q.shape[1:]
+    if modes == 1:
+        return states
+    flat = q.reshape(modes, -1)
+    near = jnp.abs(flat[1:] - flat[:-1]) <= _CLOSE * flat[1:]
+    apart, index = jnp.ones_like(near[:1]), jnp.arange(modes)[:, None]
+    first = jax.lax.cummax(jnp.where(jnp.concatenate([apart, ~near]), index, 0))
+    last = jax.lax.cummin(jnp.where(jnp.concatenate([~near, apart]), index, modes), reverse=True)
+    fields = jax.tree.map(lambda field: field.reshape(len(field), -1), shaft.spread())
+    most = min(modes, 2 * shaft.segments)
+
+    def own(mode: tuple[Array, ...]) -> Array:
+        q, size, rank, known = mode
+        return jax.lax.cond(
+            jnp.any(size > 1),
+            lambda: jnp.where(size > 1, _states(fields, q, size, rank, most), known),
+            lambda: known,
+        )
+
+    known = jnp.moveaxis(states.reshape(*states.shape[:2], modes, -1), 2, 0)
+    found = jax.lax.map(own, (jnp.take_along_axis(flat, first, axis=0), last - first + 1, index - first, known))
+    return jnp.moveaxis(found, 0, 2).reshape(*states.shape[:2], modes, *lanes)
+
+
+def _states(shaft: Shaft, q: Array, size: Array, rank: Array, most: int) -> Array:
+    """States ``(2n, 4, lanes)`` of the mode ``rank`` of the ``size`` ones at and above ``q``, at most ``most``."""
+    (before, behind), slopes = jax.jvp(partial(_conditions, shaft), (q,), (jnp.ones_like(q),))
+    links, lanes = before.shape[2:]
+    number = jnp.arange(links)
+    blocks = jnp.zeros((links, 4, links + 1, 4, lanes)).at[number, :, number].set(jnp.moveaxis(before, 2, 0))
+    blocks = blocks.at[number, :, number + 1].set(-jnp.moveaxis(behind, 2, 0))
+    matrix = blocks[:, :, 1:-1].reshape(4 * links, 4 * (links - 1), lanes)
+    vectors = jacobi_vectors(matrix)[0]
+    smallest = jnp.argsort(jnp.sum(looped_matmul(matrix, vectors) ** 2, axis=0), axis=0)[:most]
+    vectors = jnp.take_along_axis(vectors, smallest[None], axis=1)
+    x = jnp.moveaxis(vectors.reshape(links - 1, 4, most, lanes), 0, 2)
+
+    dual = matmul(jnp.asarray(_FORM)[:, :, None, None], x) * jnp.repeat(Scales.of(shaft).e3, 2, axis=0)
+    nothing = jnp.zeros_like(x[:, :, :1])
+
+    def in_front(of: Array) -> Array:
+        return jnp.concatenate([nothing, of], axis=2)
+
+    def after(of: Array) -> Array:
+        return jnp.concatenate([of, nothing], axis=2)
+
+    both = jnp.concatenate([before, behind], axis=1)
+    pair = jnp.concatenate([in_front(dual), after(dual)])
+    y = solve(matmul(both, jnp.swapaxes(both, 0, 1)), matmul(both, pair))
+
+    direction, unit = jnp.arange(most)[:, None], jnp.eye(most)[:, :, None]
+    inside = (direction[:, None] < size) & (direction[None] < size)
+
+    def form(left: Array, right: Array) -> Array:
+        product = jnp.sum(matmul(jnp.swapaxes(left, 0, 1), right), axis=2)
+        return jnp.where(inside, 0.5 * (product + jnp.swapaxes(product, 0, 1)), 0.0)
+
+    def change(links: Links) -> Array:
+        return matmul(links.before, in_front(x)) - matmul(links.behind, after(x))
+
+    mass = form(y, change(Links(*slopes))) + jnp.where(inside, 0.0, unit)
+    axes = jacobi_vectors(mass)[0]
+    axes = axes / jnp.sqrt(jnp.sum(axes * matmul(mass, axes), axis=0))
+
+    def along_axes(form: Array) -> Array:
+        return matmul(jnp.swapaxes(axes, 0, 1), matmul(form, axes))
+
+    stiffness = along_axes(form(y, change(Links(before, behind))))
+    places = along_axes(form(x, x * jnp.arange(links - 1)[:, None]))
+    places = _PARTED * q * places / jnp.sum(jnp.abs(places), axis=(0, 1))
+    stiffness = jnp.where(jnp.abs(stiffness) > _EQUAL * q, stiffness, 0.0) - places
+    # Positive, so that its singular vectors are its eigenvectors.
+    turned = jacobi_vectors(stiffness + 2 * jnp.sum(jnp.abs(stiffness), axis=(0, 1)) * unit)[0]
+    distance = -jnp.sum(turned * matmul(stiffness, turned), axis=0)
+    place = jnp.argsort(jnp.where(direction < size, distance, jnp.inf), axis=0)
+    own = jnp.take_along_axis(place, jnp.minimum(rank, most - 1)[None], axis=0)
+    combination = matmul(axes, jnp.take_along_axis(turned, own[None], axis=1))
+    return jnp.moveaxis(matmul(x, combination[:, :, None])[:, 0], 0, 1)
+
+
+def _conditions(shaft: Shaft, q: Array) -> Links:
+    """The forms along all segments, across all joints and at the ends, ``(4, 4, 2n + 1, lanes)``, at ``q`` of every lane.
+
+    At an end, two forms of its state vanish, and two of a state beyond it, which is nothing.
+    """
+    scales, q = Scales.of(shaft), q[None]
+    along, across = along_segments(Segments.of(shaft, q)), across_joints(shaft, q)
+    none, one = jnp.zeros_like(q), jnp.ones_like(q)
+
+    def end(node: int, sign: float) -> tuple[Array, Array]:
+        m, k_rot, inertia = (None if x is None else x[node] for x in (shaft.m, shaft.k_rot, shaft.inertia))
+        e1, e3 = scales.e1[node], scales.e3[node]
+        keep, add = support_shares(shaft.k[node], m, e3, q)
+        turn, hold = rotation_shares(k_rot, inertia, e1, q)
+        force, moment = (sign * add / e3, none, none, keep), (none, -sign * hold / e1, turn, none)
+        empty = (none,) * 4
+        rows = (force, moment, empty, empty), (empty, empty, (one, none, none, none), (none, one, none, none))
+        at, beyond = (jnp.stack([jnp.stack(jnp.broadcast_arrays(*row)) for row in part]) for part in rows)
+        return at, beyond
+
+    (at_a, beyond_a), (at_d, beyond_d) = end(0, 1.0), end(-1, -1.0)
+
+    def woven(first: Array, across: Array, along: Array, last: Array) -> Array:
+        segments = jnp.stack(jnp.broadcast_arrays(across, along), axis=1).reshape(-1, *along.shape[1:])[1:]
+        return jnp.moveaxis(jnp.concatenate([first[None], segments, last[None]])[..., 0, :], 0, 2)
+
+    return Links(woven(beyond_a, across.before, along.before, at_d), woven(at_a, across.behind, along.behind, beyond_d))
+
 
 # Multiple of its asymmetry up to which the product of two planes is rounding.
 _APART = 30.0

@@ -30,9 +30,16 @@ from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solv
 from drivetrain_jax.analysis.frequency_response import closed_form_response, harmonic_response, orbit_branches
 from drivetrain_jax.analysis.frequency_response.harmonic_balance import Basis
 from drivetrain_jax.analysis.frequency_response.rules import RULES
-from drivetrain_jax.analysis.impacts import exact_branch, exact_response
-from drivetrain_jax.analysis.impacts.length_unit import from_scaled_length, to_scaled_length
-from drivetrain_jax.analysis.impacts.motion import ABSENT, PHASE, REGIME, REGIMES, STABILITY
+from drivetrain_jax.analysis.impacts import exact_response
+from drivetrain_jax.analysis.impacts.motion import (
+    ABSENT,
+    PHASE,
+    REGIME,
+    REGIMES,
+    STABILITY,
+    from_scaled_length,
+    to_scaled_length,
+)
 from drivetrain_jax.systems import ForcedModel, PiecewiseLinearOscillator, System
 
 SWEEP = ("sweep_direction",)
@@ -128,12 +135,12 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
         allowed = f"0 (by the harmonics) or at least {2 * harmonics + 1}, which tell {harmonics} harmonics apart"
         raise InputError(f"options.samples = {samples}: allowed is {allowed}")
     branches = closed_form_response.BRANCHES.get(request.method, harmonic_response.BRANCHES)
-    folds = exact_branch.SPECIAL if request.method == "exact" else closed_form_response.FOLDS
+    folds = exact_response.SPECIAL if request.method == "exact" else closed_form_response.FOLDS
     return (
         Dimension("sweep_direction", "direction of the sweep", ("up", "down")),
         Dimension("branch", "number of the motion, by rising amplitude", tuple(range(1, branches + 1))),
         Dimension("fold", "number of the fold", tuple(range(1, folds + 1))),
-        Dimension("doubling", "number of the period doubling", tuple(range(1, exact_branch.SPECIAL + 1))),
+        Dimension("doubling", "number of the period doubling", tuple(range(1, exact_response.SPECIAL + 1))),
     )
 
 
@@ -218,7 +225,7 @@ def _exact_branch(
     state = jnp.take_along_axis(state, first[None, None], axis=0)[0]
     x = jnp.concatenate([state, jnp.asarray(rising)[first][None]])
     x = jnp.where(jnp.any(single, axis=0), x, jnp.nan)
-    results, complete = exact_branch.branch(model, rising, x, special=special, width=exact_response.WIDTH)
+    results, complete = exact_response.branch(model, rising, x, special=special, width=exact_response.WIDTH)
     return {name: value.reshape(*value.shape[:2], *shape) for name, value in results.items()}, complete.reshape(
         -1, *shape
     )

@@ -6,7 +6,7 @@ Results are arrays ``(L, own dimensions, ...)``, the path first, the batch last.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,14 +14,326 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis._base import Outcome
-from drivetrain_jax.analysis.frequency_response.harmonic_balance import Basis, balance, contact
-from drivetrain_jax.analysis.frequency_response.harmonic_branch import Branch, at_frequency, trace
-from drivetrain_jax.analysis.frequency_response.harmonic_stability import half_trace, spectral_radius
-from drivetrain_jax.analysis.frequency_response.harmonic_sweep import sweep
+from drivetrain_jax.analysis.frequency_response.harmonic_balance import (
+    Balanced,
+    Basis,
+    balance,
+    contact,
+    drift,
+    half_trace,
+    jacobian,
+    residual,
+    spectral_radius,
+)
 from drivetrain_jax.analysis.impacts.motion import ABSENT, STABLE, UNSTABLE, imbalance, phase_lag, regime
-from drivetrain_jax.analysis.numerics.amplitude_roots import refined
-from drivetrain_jax.analysis.numerics.branch_sections import course, distinct
+from drivetrain_jax.analysis.numerics.branch_sections import Course, course, distinct, refined, sections
+from drivetrain_jax.analysis.numerics.linear_algebra import solve
 from drivetrain_jax.systems import PiecewiseLinearOscillator
+
+# The branch of balanced motions through a given motion, stable or not, by arc-length continuation through folds.
+#
+# The branch is a curve of points ``(x/scale, omega/width)``. A step goes along the tangent; Newton iterations in the
+# plane across the tangent lead back to the curve. Every lane has its own step length, shortened where the iterations
+# fail and lengthened where they converge quickly.
+
+
+# Most steps, failed ones included; first, shortest and longest step in scaled units; Newton iterations per step.
+_ATTEMPTS, _FIRST, _SHORTEST, _LONGEST, _CORRECTIONS = 1500, 0.02, 1e-6, 0.08, 5
+# Largest last correction; least cosine of the turn of the tangent for a step to be kept, and for a longer next step.
+_CLOSED, _LEAST_COSINE, _STRAIGHT = 1e-9, 0.97, 0.996
+_POLISH = 8
+
+
+class Branch(NamedTuple):
+    """Points of a branch: coefficients ``(S, n, ...)`` and frequencies ``(S, ...)``, NaN after the last point.
+
+    ``complete`` is true if the branch has reached the far end of the frequencies.
+    """
+
+    x: Array
+    omega: Array
+    complete: Array
+
+
+class _Front(NamedTuple):
+    """The last point, its tangent, the step length and the number of the point."""
+
+    point: Array
+    tangent: Array
+    length: Array
+    number: Array
+
+
+def _bordered(
+    model: PiecewiseLinearOscillator, basis: Basis, units: tuple[Array, Array], point: Array, tangent: Array
+) -> tuple[Array, Array]:
+    """Residual (scaled unknowns) and the matrix of its derivatives with ``tangent`` as last row."""
+    scale, width = units
+    x, omega = point[:-1] * scale, point[-1] * width
+    touch = contact(model, basis, x)
+    force, by_omega = residual(model, basis, x, omega, touch)
+    inner = jacobian(model, basis, omega, touch) * scale
+    rows = jnp.concatenate([inner, (by_omega * width)[:, None]], axis=1)
+    return force, jnp.concatenate([rows, tangent[None]])
+
+
+def _normalised(vector: Array) -> Array:
+    return vector / jnp.sqrt(jnp.sum(vector**2, axis=0))
+
+
+def _advance(
+    model: PiecewiseLinearOscillator, basis: Basis, units: tuple[Array, Array], front: _Front
+) -> tuple[Array, Array, Array, Array]:
+    """Point and tangent after a trial step, and two flags: the iterations converged, and they converged quickly."""
+    guess = front.point + front.length * front.tangent
+
+    def correct(_: Any, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        point, _, first, _ = state
+        force, matrix = _bordered(model, basis, units, point, front.tangent)
+        along = jnp.sum(front.tangent * (point - guess), axis=0)
+        right = jnp.zeros_like(point).at[-1].set(1.0)
+        known = jnp.stack([jnp.concatenate([force, along[None]]), right], axis=1)
+        solution = solve(matrix, known)
+        change = jnp.sqrt(jnp.sum(solution[:, 0] ** 2, axis=0))
+        return point - solution[:, 0], solution[:, 1], jnp.where(first < 0, change, first), change
+
+    lost = jnp.full(front.length.shape, -1.0)
+    point, tangent, first, last = jax.lax.fori_loop(0, _CORRECTIONS, correct, (guess, front.tangent, lost, lost))
+    tangent = _normalised(tangent)
+    turned = jnp.sum(tangent * front.tangent, axis=0)
+    closed = (last < _CLOSED) & (turned > _LEAST_COSINE) & jnp.all(jnp.isfinite(point), axis=0)
+    return point, tangent, closed, (first < 0.1 * front.length) & (turned > _STRAIGHT)
+
+
+def trace(model: PiecewiseLinearOscillator, basis: Basis, x: Array, start: float, stop: float, scale: Array) -> Branch:
+    """The branch through the balanced motion ``x`` (n, N) at the frequency ``start``, continued towards ``stop``.
+
+    The branch ends where it leaves the range of frequencies on either side, or after a fixed number of steps.
+    """
+    lanes = x.shape[1:]
+    width = abs(stop - start)
+    units = (scale, jnp.full(lanes, width))
+    point = jnp.concatenate([x / scale, jnp.full((1, *lanes), start / width)])
+    forwards = jnp.zeros_like(point).at[-1].set(1.0 if stop > start else -1.0)
+    _, matrix = _bordered(model, basis, units, point, forwards)
+    tangent = _normalised(solve(matrix, jnp.abs(forwards)[:, None])[:, 0])
+    front = _Front(point, tangent, jnp.full(lanes, _FIRST), jnp.zeros(lanes, jnp.int32))
+    points = jnp.full((_ATTEMPTS, *point.shape), jnp.nan).at[0].set(point)
+    low, high = min(start, stop), max(start, stop)
+
+    def attempt(state: tuple[Array, _Front, Array, Array]) -> tuple[Array, _Front, Array, Array]:
+        count, front, going, points = state
+        point, tangent, closed, quick = _advance(model, basis, units, front)
+        moved = going & closed
+        length = jnp.where(closed, jnp.where(quick, 1.4, 1.0), 0.4) * front.length
+        after = _Front(
+            jnp.where(moved, point, front.point),
+            jnp.where(moved, tangent, front.tangent),
+            jnp.minimum(length, _LONGEST),
+            front.number + moved,
+        )
+        points = points.at[after.number, :, jnp.arange(lanes[0])].set(after.point.T)
+        omega = after.point[-1] * width
+        inside = (omega >= low * (1 - 1e-9)) & (omega <= high * (1 + 1e-9))
+        return count + 1, after, going & inside & (length > _SHORTEST), points
+
+    def unfinished(state: tuple[Array, _Front, Array, Array]) -> Array:
+        return (state[0] < _ATTEMPTS - 1) & jnp.any(state[2])
+
+    going = jnp.all(jnp.isfinite(point), axis=0)
+    _, front, _, points = jax.lax.while_loop(unfinished, attempt, (jnp.int32(0), front, going, points))
+    end = front.point[-1] * width
+    complete = end >= high if stop > start else end <= low
+    return Branch(points[:, :-1] * scale, points[:, -1] * width, complete)
+
+
+def at_frequency(
+    model: PiecewiseLinearOscillator, basis: Basis, branch: Course, omega: Array, count: int
+) -> tuple[Array, Array, Array, Array]:
+    """Up to ``count`` balanced motions at ``omega`` in the order of the branch, ``(count, n, ...)``, and three flags.
+
+    The flags mark existing motions, saddles of the balance, and lanes whose motions are all found.
+    """
+    guess, exists, every = sections(branch, omega, count)
+
+    def improved(x: Array) -> tuple[Array, Array, Array]:
+        found = balance(model, basis, x, omega + jnp.zeros(x.shape[1:]), _POLISH)
+        return found.x, found.converged, found.saddle
+
+    found, converged, saddle = jax.lax.map(improved, guess[:, :-1])
+    return found, exists & converged, saddle, every & jnp.all(converged | ~exists, axis=0)
+
+
+# Slow sweeps of the drive's frequency by harmonic balance.
+#
+# At each frequency Newton iterations start from the motion at the previous frequency. As in an experiment, the sweep
+# leaves a motion if the iterations diverge, if the motion jumps, or if it becomes unstable within the basis (a fold, or
+# a doubled period with subharmonics in the basis). The equation of motion is then integrated until it has settled. From
+# the settled motion the drift of the balance and Newton iterations lead to a balanced motion. If this fails, the motion
+# of the first Newton iterations is kept and marked as unstable.
+
+
+# Length of transients: until disturbances have decayed by this factor, within limits in drive periods. Steps: per radian of
+# the stiffest motion, within limits per drive period. Low accuracy is enough to reach the right basin.
+_SETTLED, _PERIODS = 1e-4, (24, 400)
+_PER_RADIAN, _STEPS = 4.0, (64, 4000)
+# Steps for each frequency of a path after which no further transient of a lane begins. A transient of a usual oscillator
+# takes up to 6e4 steps, of an extreme one 1.6e6.
+_MOST_WORK = 100_000
+# Change of the motion between two frequencies, relative to its size, beyond which it is a jump.
+_JUMP = 0.35
+# Growth of a motion of doubled period above which it is unstable.
+_GROWS = 1e-7
+_PUSH = 0.05
+# Attempts at one frequency: close to a fold the drift is slow.
+_WAITS = 8
+
+
+class Swept(NamedTuple):
+    """A motion of the sweep: coefficients ``(n, ...)``, half trace of its transition, and flags of balanced motions and of
+    saddles of the balance."""
+
+    x: Array
+    half: Array
+    balanced: Array
+    saddle: Array
+
+
+def _effort(model: PiecewiseLinearOscillator, basis: Basis, omega: Array) -> tuple[Array, Array]:
+    """Base periods for settling, and steps between two samples; both depend on the lane alone, not on its batch."""
+    fastest = jnp.sqrt(model.stiffness * jnp.maximum(model.alpha, 1.0)) / omega
+    steps = jnp.clip(2 * np.pi * _PER_RADIAN * fastest, *_STEPS)
+    decay = -np.log(_SETTLED) * omega / (np.pi * jnp.maximum(model.damping, 1e-12 * omega))
+    periods = jnp.clip(jnp.ceil(decay / basis.order), *(p // basis.order for p in _PERIODS))
+    return periods.astype(jnp.int32), jnp.ceil(steps * basis.order / basis.count).astype(jnp.int32)
+
+
+def settle(
+    model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array, wanted: Array | bool = True
+) -> Array:
+    """Coefficients of the motion after a transient from the state of ``x`` at tau = 0, in the ``wanted`` lanes."""
+    lanes = x.shape[1:]
+    start = jnp.asarray(basis.at(np.zeros(1))[0]), jnp.asarray((basis.at(np.zeros(1)) @ basis.derivative)[0])
+    u, v = jnp.tensordot(start[0], x, 1), jnp.tensordot(start[1], x, 1) * omega / basis.order
+    # An exactly periodic motion never leaves an unstable orbit: a small offset lets disturbances grow.
+    u = u + _PUSH * jnp.sqrt(jnp.sum(x[1:] ** 2, axis=0))
+    sampled = Basis(basis.harmonics, basis.order, max(_STEPS[0], 1 << (2 * basis.harmonics).bit_length()))
+    effort = (jnp.where(wanted, number, 0) for number in _effort(model, sampled, omega))
+    periods, parts = (jnp.broadcast_to(number, lanes) for number in effort)
+    turn = parts * sampled.count
+    h = 2 * np.pi * basis.order / (jnp.maximum(turn, 1) * omega)
+
+    def advance(number: Array, until: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        moved = _runge_kutta(model, omega, (number % jnp.maximum(turn, 1)) * h, h, state)
+        return tuple(jnp.where(number < until, new, old) for new, old in zip(moved, state, strict=True))  # pyright: ignore[reportReturnType]
+
+    def project(sample: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        u, v, total = carry
+        total = total + jnp.asarray(sampled.projection)[:, sample].reshape(-1, *(1,) * len(lanes)) * u
+        first, last = sample * parts, (sample + 1) * parts
+        u, v = jax.lax.fori_loop(0, jnp.max(parts), lambda i, state: advance(first + i, last, state), (u, v))
+        return u, v, total
+
+    whole = periods * turn
+    u, v = jax.lax.fori_loop(0, jnp.max(whole), lambda i, state: advance(i, whole, state), (u, v))
+    return jax.lax.fori_loop(0, sampled.count, project, (u, v, jnp.zeros_like(x)))[2]
+
+
+def _runge_kutta(
+    model: PiecewiseLinearOscillator, omega: Array, t: Array, h: Array, state: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """One step of the classical Runge-Kutta scheme."""
+
+    def rate(t: Array, u: Array, v: Array) -> tuple[Array, Array]:
+        drive = model.B0 + model.amplitude(omega) * jnp.cos(omega * t)
+        return v, drive - model.damping * v - model.stiffness * model.restoring(u)
+
+    u, v = state
+    total_u, total_v, du, dv = 0.0, 0.0, 0.0, 0.0
+    for lead, weight in ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6)):
+        du, dv = rate(t + lead * h, u + lead * h * du, v + lead * h * dv)
+        total_u, total_v = total_u + weight * du, total_v + weight * dv
+    return u + h * total_u, v + h * total_v
+
+
+def _checked(model: PiecewiseLinearOscillator, basis: Basis, found: Balanced, omega: Array) -> tuple[Swept, Array]:
+    """A balanced motion with its half trace, and a flag: true if it is an attractor within the basis."""
+    half = half_trace(model, basis, omega, contact(model, basis, found.x))
+    growth = spectral_radius(model, basis, omega, half)
+    # Without subharmonics the basis has no motion of doubled period.
+    followed = (half > 1) | (basis.order > 1)
+    attracts = found.converged & ~found.saddle & ~((growth > 1 + _GROWS) & followed)
+    return Swept(found.x, half, found.converged, found.saddle), attracts
+
+
+def _kept(condition: Array, first: Swept, second: Swept) -> Swept:
+    return Swept(*(jnp.where(condition, a, b) for a, b in zip(first, second, strict=True)))
+
+
+def _work(model: PiecewiseLinearOscillator, basis: Basis, omega: Array) -> Array:
+    """Steps of a transient."""
+    periods, steps = _effort(model, basis, omega)
+    return 1.0 * periods * steps * basis.count
+
+
+def step(
+    model: PiecewiseLinearOscillator, basis: Basis, before: Swept, omega: Array, may_settle: Array
+) -> tuple[Swept, Swept, Array]:
+    """Two versions of the motion at ``omega``: the start of the next step and the result; and flags of transients.
+
+    Both follow from the motion ``before`` at the previous frequency, and differ where the result is not balanced. Only lanes
+    that ``may_settle`` have transients.
+    """
+    size = jnp.sqrt(jnp.sum(before.x[1:] ** 2, axis=0))
+
+    def waited(count: Array, lost: Array, seed: Array, now: Swept) -> Array:
+        # Integrate once only: past a fold of the balance that the exact motion lacks, it would return there every time.
+        start = jax.lax.cond(
+            (count == 1) & jnp.any(lost & may_settle),
+            lambda seed: jnp.where(may_settle, settle(model, basis, seed, omega, lost & may_settle), seed),
+            lambda seed: seed,
+            seed,
+        )
+        found = drift(model, basis, jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, seed), omega)
+        return jnp.where(lost, jnp.where(jnp.all(jnp.isfinite(found), axis=0), found, seed), now.x)
+
+    def attempt(state: tuple[Array, Array, Array, Array, Swept]) -> tuple[Array, Array, Array, Array, Swept]:
+        count, lost, settled, seed, now = state
+        again = count > 0
+        seed = jax.lax.cond(again, waited, lambda count, lost, seed, now: seed, count, lost, seed, now)
+        there, attracts = _checked(model, basis, balance(model, basis, seed, omega), omega)
+        change = jnp.sqrt(jnp.sum((there.x - before.x)[1:] ** 2, axis=0))
+        jumped = ~again & before.balanced & (change > _JUMP * size)
+        # The settled motion replaces the lost one if it attracts, or if the lost one is not balanced.
+        taken = jnp.where(again, lost & (attracts | ~now.balanced), True)
+        settled |= (count == 1) & lost & may_settle
+        return count + 1, lost & (~attracts | jumped), settled, seed, _kept(taken, there, now)
+
+    def unfinished(state: tuple[Array, Array, Array, Array, Swept]) -> Array:
+        return (state[0] < _WAITS) & jnp.any(state[1])
+
+    start = (jnp.int32(0), jnp.ones_like(before.balanced), jnp.zeros_like(before.balanced), before.x, before)
+    _, _, settled, _, after = jax.lax.while_loop(unfinished, attempt, start)
+    # A motion that could not be balanced is no start for the next one.
+    carried = after._replace(x=jnp.where(after.balanced, after.x, before.x))
+    return carried, after, settled
+
+
+def sweep(model: PiecewiseLinearOscillator, basis: Basis, omegas: Array) -> Swept:
+    """Motions along ``omegas`` (L, N), a path for each lane, starting from rest; fields ``(L, ...)``."""
+    lanes = omegas.shape[1:]
+    first = settle(model, basis, jnp.zeros((basis.size, *lanes)), omegas[0])
+    first = jnp.where(jnp.isfinite(first), first, 0.0)
+    start = Swept(first, jnp.zeros(lanes), jnp.zeros(lanes, bool), jnp.zeros(lanes, bool))
+    most = _MOST_WORK * len(omegas)
+
+    def onwards(carry: tuple[Swept, Array], omega: Array) -> tuple[tuple[Swept, Array], Swept]:
+        before, spent = carry
+        carried, after, settled = step(model, basis, before, omega, spent < most)
+        return (carried, spent + jnp.where(settled, _work(model, basis, omega), 0.0)), after
+
+    return jax.lax.scan(onwards, (start, jnp.zeros(lanes)), omegas)[1]
+
 
 BRANCHES = 7
 _LARGEST_STEP, _MOST_PARTS = 0.02, 8

@@ -7,7 +7,7 @@ own pace, so a lane that settles slowly, or never, does not delay the others.
 A lane settles period by period and from time to time tries Newton shooting from its state: ``z <- z + (1 - M)^-1 (F^m(z) -
 z)``, where M is the exact transition matrix over m periods and the motion nearly recurs after m periods. An orbit is
 accepted as the attractor under two conditions: all its multipliers lie inside the unit circle, and the motion, continued
-from the start of the search, approaches the orbit (:mod:`~drivetrain_jax.analysis.impacts.attractor_approach`).
+from the start of the search, approaches the orbit (:mod:`~drivetrain_jax.analysis.impacts.attractor_lanes`).
 """
 
 from __future__ import annotations
@@ -20,15 +20,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.impacts.attractor_approach import Orbit, attracts, is_slow, linearisation_holds, reach
 from drivetrain_jax.analysis.impacts.attractor_lanes import (
     MOST_PERIODS,
     Lane,
+    Orbit,
     approach,
+    attracts,
     blank,
     candidates,
     confirm,
     enter,
+    is_slow,
+    linearisation_holds,
+    reach,
     record,
     restart,
     resume,
@@ -37,6 +41,7 @@ from drivetrain_jax.analysis.impacts.attractor_lanes import (
     settle,
     try_line,
 )
+from drivetrain_jax.analysis.impacts.motion import Matrix, log_determinant, newton_correction
 from drivetrain_jax.analysis.impacts.piecewise_march import (
     FEW,
     Lanes,
@@ -47,7 +52,6 @@ from drivetrain_jax.analysis.impacts.piecewise_march import (
     prepare,
     stays,
 )
-from drivetrain_jax.analysis.impacts.plane_map import Matrix, log_determinant, newton_correction
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 # Newton: most corrections, relative size of the last correction, and size below which corrections may stall by rounding.

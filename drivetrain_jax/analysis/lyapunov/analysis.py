@@ -4,9 +4,9 @@ The exponents of an equilibrium or a periodic motion are those of its orbit (:mo
 the others are averages. They are natural logarithms per second, in falling order. Phases of the flow are left out, because
 their exponents are always zero. The paper's estimator is available under its own name.
 
-The number of steps is predicted for every point (see :mod:`~drivetrain_jax.analysis.lyapunov.march_steps`) unless
+The number of steps is predicted for every point (see :mod:`~drivetrain_jax.analysis.lyapunov.variational`) unless
 ``steps`` is given; members of a batch with similar numbers use the largest of them (see
-:mod:`~drivetrain_jax.analysis.lyapunov.step_groups`).
+:mod:`~drivetrain_jax.analysis.lyapunov.analysis`).
 
 Outcome: ``SUCCESS``, or ``TOLERANCE_NOT_MET`` if the standard error exceeds the target at ``max_time`` or the steps are too
 few: the exponents do not sum to the mean divergence, or a positive exponent changes with half the steps. With too few steps
@@ -19,7 +19,7 @@ the verdict is ``undecided``. The exponents of an unbounded motion are means unt
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -28,27 +28,101 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis._base import MOST_SECONDS, Analysis, Outcome, Request, Solver, in_time_of
-from drivetrain_jax.analysis.lyapunov.forcing import may_be_chaotic, may_rest
+from drivetrain_jax.analysis._base import MOST_SECONDS, MOST_STEPS, Analysis, Outcome, Request, Solver, in_time_of
 from drivetrain_jax.analysis.lyapunov.growth_record import (
     SEGMENTS,
     SETTLED,
+    STANDARD_ERRORS,
     Record,
     block_mean,
     mean_growth,
     record_growth,
+    resolved,
     running_mean,
     weighted_mean,
+    zero_floor,
 )
-from drivetrain_jax.analysis.lyapunov.march_steps import LEAST, contraction, needed_steps
-from drivetrain_jax.analysis.lyapunov.orbit import common_period
-from drivetrain_jax.analysis.lyapunov.paper_estimator import paper_estimator
-from drivetrain_jax.analysis.lyapunov.resolution import STANDARD_ERRORS, resolved, zero_floor
-from drivetrain_jax.analysis.lyapunov.sampling import SAMPLES, sample
-from drivetrain_jax.analysis.lyapunov.step_groups import by_groups, is_short_enough, starts
+from drivetrain_jax.analysis.lyapunov.orbit import common_period, may_be_chaotic, may_rest
+from drivetrain_jax.analysis.lyapunov.section_measures import SAMPLES, paper_estimator, sample
+from drivetrain_jax.analysis.lyapunov.variational import (
+    LEAST,
+    MOST,
+    batch_shape,
+    contraction,
+    initial_state,
+    needed_steps,
+)
 from drivetrain_jax.analysis.lyapunov.verdict import Evidence, Verdict, follows, judge
 from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.systems import Flow, System
+
+# Limits on the work of a run, and groups of members that need a similar number of steps.
+#
+# A batch marches in lockstep: every member pays for the most steps per strobe and for the most strobes of all members.
+# One group for each range of steps bounds this product, so an extreme member does not multiply the work of the others.
+
+
+# Most steps of a run of up to a second with predicted steps, in proportion for a longer one: half a minute on one core. The
+# paper's scenes take 1e6 steps in 4 s, and the driveshaft at 10 Hz takes 3e6.
+MOST_WORK = 2e7
+# Upper limits of the steps per strobe of each group.
+_GROUPS = (200, 1000, 5000, 25_000, MOST)
+
+
+def starts(flow: Flow) -> Array:
+    """Flags where the period, the state and the field are finite at the start, shape (...)."""
+    y = initial_state(flow)
+    values = (flow.period, *y, *flow.field(flow.angles(0, 0.0), y))
+    return jnp.broadcast_to(reduce(jnp.logical_and, map(jnp.isfinite, map(jnp.asarray, values))), batch_shape(flow))
+
+
+def is_short_enough(steps: Any, strobes: Any, following: int, request: Request) -> Any:
+    """Flags where ``strobes`` in ``max_time`` and the ``following`` ones are within the limits of work.
+
+    The limit grows with given ``steps``, because the user asked for them.
+    """
+    given, longest = request.options["steps"], request.options["max_time"]
+    most = MOST_WORK * max(1.0, longest) * max(1.0, (given or LEAST) / LEAST)
+    within = (steps * strobes <= MOST_STEPS) & (steps * (strobes + SEGMENTS + following) <= most)
+    return within if given else within & (steps <= MOST)
+
+
+def by_groups(
+    flow: Flow,
+    request: Request,
+    following: int,
+    march: Callable[[Any, Array], dict[str, Array]],
+    blank: Mapping[str, Any],
+) -> dict[str, Array]:
+    """Results of ``march(steps, members)`` of each group, merged; those of members without a march are ``blank`` or NaN.
+
+    The outcome is ``NOT_FINITE`` without a start.
+    """
+    given = request.options["steps"]
+    needed = jnp.full(batch_shape(flow), float(given)) if given else needed_steps(flow)
+    started = starts(flow)
+    able = started & is_short_enough(needed, request.options["max_time"] / jnp.asarray(flow.period), following, request)
+
+    def empty() -> dict[str, Array]:
+        shapes = jax.eval_shape(lambda: march(given or jnp.int64(LEAST), able))
+        found = {name: jnp.full(x.shape, blank.get(name, jnp.nan), x.dtype) for name, x in shapes.items()}
+        return found | {"outcome": jnp.where(started, found["outcome"], jnp.int8(Outcome.NOT_FINITE))}
+
+    def group(found: dict[str, Array], limits: tuple[Any, Any]) -> tuple[dict[str, Array], None]:
+        members = able & (needed > limits[0]) & (needed <= limits[1])
+        steps = given or jnp.max(jnp.where(members, needed, LEAST)).astype(jnp.int64)
+
+        def merged() -> dict[str, Array]:
+            new = march(steps, members)
+            return {name: jnp.where(members, new[name], x) for name, x in found.items()}
+
+        return jax.lax.cond(jnp.any(members), merged, lambda: found), None
+
+    if given or flow.fastest is None:
+        return group(empty(), (0.0, jnp.inf))[0]
+    limits = jnp.array([0.0, *_GROUPS[:-1]]), jnp.array(_GROUPS, float)
+    return jax.lax.scan(group, empty(), limits)[0]
+
 
 VARIABLES = (
     Variable("lyapunov_spectrum", "1/s", "Lyapunov exponent", ("exponent",)),
@@ -263,7 +337,7 @@ def _effort(system: type[System], request: Request, columns: Mapping[str, np.nda
     """Predicted steps, shape (N,), of the run and of the strobes after it.
 
     A run with a target for the standard error ends early if contraction settles the motion before ``max_time``. Infinite
-    above the limits of :mod:`~drivetrain_jax.analysis.lyapunov.step_groups`.
+    above the limits of :mod:`~drivetrain_jax.analysis.lyapunov.analysis`.
     """
     options, longest = request.options, request.options["max_time"]
     rate, period, steps, started = predicted(_prediction, (system.models["lyapunov"].build,), columns)

@@ -14,8 +14,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax.analysis.lyapunov.growth_record import SEGMENTS
-from drivetrain_jax.analysis.lyapunov.resolution import STANDARD_ERRORS, SUM_RULE, significant, zero_floor
+from drivetrain_jax.analysis.lyapunov.growth_record import SEGMENTS, STANDARD_ERRORS, SUM_RULE, significant, zero_floor
 
 CHAOTIC_K = 0.9
 # Least logarithmic growth that counts as exponential, over the averaged three quarters of the time: twice that of growth in

@@ -24,12 +24,12 @@ from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver, st
 from drivetrain_jax.analysis.modes.mode_types import (
     BlockModes,
     block_modes,
+    follow,
     is_rigid,
     mode_type_names,
     mode_types,
     one_frequency,
 )
-from drivetrain_jax.analysis.modes.tracking import follow
 from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lane_count, path_entry, with_path
 from drivetrain_jax.analysis.numerics.singular_values import EPS, Bidiagonal, bidiagonal_form, bidiagonal_values
 from drivetrain_jax.resonances import operating_range
