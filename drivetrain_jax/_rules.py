@@ -1,8 +1,12 @@
-"""Rules for the numbers of a result, each a function of the Dataset alone. NaN obeys every rule."""
+"""Rules for the numbers of a result, each a function of the Dataset alone, and the rules of every analysis.
+
+NaN obeys every rule.
+"""
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -99,3 +103,203 @@ class Declared:
     def __post_init__(self) -> None:
         if not isinstance(self.rules, tuple) or not all(isinstance(rule, Rule) for rule in self.rules):
             raise TypeError(f"rules: got {shown(self.rules)}; allowed is a tuple of rules, (rule, ...)")
+
+
+ATLAS = Declared(
+    (in_order("lower", "upper"), in_order("panel_lower", "panel_upper"), within("panel_degrees", 1.0)),
+    has_points=False,
+)
+
+
+# Error of a radius that is known to be 1: four roundings.
+_ROUNDING = 1e-15
+
+
+def _all_multipliers(compare: Callable[[xr.DataArray, xr.Dataset], xr.DataArray]) -> Callable:
+    return lambda ds: compare(abs(ds["floquet_multiplier"]).max("multiplier"), ds)
+
+
+def _liouville(ds: xr.Dataset) -> xr.DataArray:
+    """True where the residual contradicts the bound: a coefficient's error e moves the largest of n roots by e/2^n."""
+    # If the multipliers are not stored, n is four as for cardan. A larger n misses errors, a smaller n reports false ones.
+    n = ds.sizes.get("multiplier", 4)
+    wrong = abs(ds["liouville_residual"]) > 2**n * ds["spectral_radius_error"] / ds["spectral_radius"]
+    return wrong & ~_is_one(ds)
+
+
+def _is_one(ds: xr.Dataset) -> xr.DataArray:
+    """True where the radius is known to be 1: without damping, if all multipliers are simple and on the unit circle."""
+    rho, error = ds["spectral_radius"], ds["spectral_radius_error"]
+    return (error <= _ROUNDING) & (abs(rho - 1) <= error)
+
+
+def _verdict(ds: xr.Dataset) -> xr.DataArray:
+    """0 stable, 1 unstable, 2 undecided, from the interval of the spectral radius.
+
+    Where the radius is 1, stable means bounded. Without damping an atlas also knows it to exceed 1 within its interval.
+    """
+    rho, error, verdict = ds["spectral_radius"], ds["spectral_radius_error"], ds["verdict"]
+    stable, unstable = (rho + error < 1) | _is_one(ds), rho - error > 1
+    return (stable != (verdict == 0)) | (unstable & (verdict != 1)) | ((rho + error <= 1) & (verdict == 1))
+
+
+FLOQUET = Declared(
+    (
+        ordered("floquet_multiplier", "multiplier", falling=True, key=abs),
+        relation(
+            "spectral_radius is the largest modulus of floquet_multiplier",
+            ("spectral_radius", "floquet_multiplier"),
+            _all_multipliers(lambda top, ds: abs(top - ds["spectral_radius"]) > 1e-9 * top),
+        ),
+        relation(
+            "verdict follows from spectral_radius and its bound",
+            ("verdict", "spectral_radius", "spectral_radius_error"),
+            _verdict,
+        ),
+        relation(
+            "liouville_residual lies within the bound of spectral_radius",
+            ("liouville_residual", "spectral_radius", "spectral_radius_error"),
+            _liouville,
+        ),
+        within("spectral_radius", 0.0),
+    ),
+)
+
+
+FORCED = Declared(
+    (within("amplitude", 0.0), within("condition", 1.0), within("orbit_amplitude", 0.0)), kept=("condition",)
+)
+
+
+def _rms_too_large(ds: xr.Dataset) -> xr.DataArray:
+    largest = xr.where(abs(ds["u_max"]) > abs(ds["u_min"]), abs(ds["u_max"]), abs(ds["u_min"]))
+    return ds["u_rms"] > largest * (1 + 1e-9)
+
+
+# Rules of motions, shared with frequency responses.
+MOTION = (
+    in_order("u_min", "u_max"),
+    within("u_rms", 0.0),
+    within("spectral_radius", 0.0),
+    within("period_multiple", 0.0),
+    relation("u_rms <= max |u|", ("u_rms", "u_max", "u_min"), _rms_too_large),
+)
+
+STEADY_STATE = Declared(
+    (
+        *MOTION,
+        in_order("u_min", "u_mean", "u_max"),
+        within("impacts", 0.0),
+        within("contact_fraction", 0.0, 1.0),
+    ),
+    # NaN is allowed: a motion that never repeats has no multipliers, a motion at rest has no phase, and a spectral radius
+    # that underflows has no exponent.
+    gaps=("phase", "spectral_radius", "floquet_multiplier", "lyapunov_exponent", "state_error"),
+)
+
+
+FREQUENCY_RESPONSE = Declared(
+    (*MOTION, in_order("branch_u_min", "branch_u_max"), ordered("fold_frequency", "fold")),
+    # NaN is allowed: the dimensions of branches and folds are longer than most points need, a motion at rest has no phase,
+    # and some frequencies have no backbone.
+    gaps=(
+        "phase",
+        "branch_u_max",
+        "branch_u_min",
+        "fold_frequency",
+        "doubling_frequency",
+        "backbone_amplitude",
+        "peak_amplitude",
+        "peak_frequency",
+        "spectral_radius",
+        "state_error",
+    ),
+    kept=("fit_range",),
+)
+
+
+BASINS = Declared(
+    (
+        within("basin_fraction", 0.0, 1.0),
+        sums_to_one("basin_fraction", "attractor", ("unsettled_fraction",)),
+        in_order("attractor_u_min", "attractor_u_max"),
+    ),
+    # NaN is allowed: results hold up to eight attractors, and most points have fewer.
+    gaps=("basin_fraction", "basin_error", "attractor_u_max", "attractor_u_min"),
+    kept=("unsettled_fraction",),
+)
+
+
+# Largest residual if all exponents are nearly zero [1/s]: volume changes by rounding and steps.
+_VOLUME_RATE = 1e-9
+
+
+def _sum_rule(ds: xr.Dataset) -> xr.DataArray:
+    """After a success the exponents must sum to the mean divergence."""
+    allowed = 1e-2 * abs(ds["lyapunov_spectrum"]).sum("exponent") + _VOLUME_RATE
+    return (abs(ds["sum_rule_residual"]) > allowed) & (ds["outcome"] == 0)
+
+
+LYAPUNOV = Declared(
+    (
+        ordered("lyapunov_spectrum", "exponent", falling=True),
+        relation("the exponents sum to the mean divergence", ("sum_rule_residual", "lyapunov_spectrum"), _sum_rule),
+        within("chaos_k01", -1.0, 1.0),
+        within("period_multiple", 0.0),
+    ),
+    # NaN is allowed: an unbounded motion has only exponents, and the history of a run ends where it converged.
+    gaps=(
+        "lyapunov_standard_error",
+        "lyapunov_history",
+        "sum_rule_residual",
+        "paper_estimator",
+        "chaos_k01",
+    ),
+)
+
+
+POINCARE = Declared(
+    (within("distinct_points", 0.0), within("chaos_k01", -1.0, 1.0)),
+    # K is undefined for a short section that does not repeat.
+    gaps=("chaos_k01",),
+)
+
+
+MODES = Declared(
+    (
+        ordered("natural_frequency", "mode"),
+        within("natural_frequency", 0.0),
+        within("participation", 0.0, 1.0),
+        sums_to_one("participation", "family"),
+        within("dominant_share", 0.0, 1.0),
+        within("kinetic_energy", 0.0, 1.0),
+        sums_to_one("kinetic_energy", "body"),
+        within("mac", 0.0, 1.0),
+    )
+)
+
+
+CRITICAL_SPEEDS = Declared(
+    (
+        ordered("natural_frequency", "mode"),
+        within("natural_frequency", 0.0),
+        multiple("angular_frequency", 2 * math.pi, "natural_frequency"),
+        multiple("critical_speed", 60.0, "natural_frequency"),
+        within("count_certified", 0.0, 1.0),
+        within("mode_shape", -1.0, 1.0),
+    )
+)
+
+# Rules of the analyses of this package by name.
+BUILT_IN = {
+    "atlas": ATLAS,
+    "floquet": FLOQUET,
+    "forced": FORCED,
+    "steady_state": STEADY_STATE,
+    "frequency_response": FREQUENCY_RESPONSE,
+    "basins": BASINS,
+    "lyapunov": LYAPUNOV,
+    "poincare": POINCARE,
+    "modes": MODES,
+    "critical_speeds": CRITICAL_SPEEDS,
+}

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib import import_module
 
 import numpy as np
 import xarray as xr
@@ -17,7 +16,7 @@ import xarray as xr
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._plugins import RULES, call_plugin, load_plugin
 from drivetrain_jax._quantities import FIRST_FAILURE
-from drivetrain_jax._rules import Declared, Rule, in_order, multiple, ordered, relation, sums_to_one, within
+from drivetrain_jax._rules import BUILT_IN, Declared, Rule, in_order, multiple, ordered, relation, sums_to_one, within
 
 __all__ = [
     "Declared",
@@ -32,20 +31,6 @@ __all__ = [
     "sums_to_one",
     "within",
 ]
-
-# Analyses with rules, analysis/NAME/rules.py.
-_BUILT_IN = (
-    "atlas",
-    "floquet",
-    "forced",
-    "lyapunov",
-    "poincare",
-    "modes",
-    "critical_speeds",
-    "steady_state",
-    "frequency_response",
-    "basins",
-)
 
 
 @dataclass(frozen=True)
@@ -144,8 +129,8 @@ def _errors(dataset: xr.Dataset) -> Iterator[Rule]:
 
 def declared(analysis: str) -> Declared:
     """The declaration of the analysis with this name."""
-    if analysis in _BUILT_IN:
-        return import_module(f"drivetrain_jax.analysis.{analysis}.rules").RULES
+    if analysis in BUILT_IN:
+        return BUILT_IN[analysis]
     try:
         found = load_plugin(RULES, analysis, "the rules of an analysis", lambda x: isinstance(x, Declared))
     except ImportError as error:

@@ -9,7 +9,7 @@ import numpy as np
 
 from drivetrain_jax._wording import counted
 from drivetrain_jax.analysis import Analysis, Request
-from drivetrain_jax.analysis.atlas.solves import ANALYSIS
+from drivetrain_jax.analysis.atlas.analysis import SOLVES
 from drivetrain_jax.atlas import (
     Atlas,
     StabilityAtlas,
@@ -89,7 +89,7 @@ def fixed_of(scene: Scene, ranges: Mapping[str, tuple[float, float]]) -> dict[st
     """The parameters of the propagator that are not in ``ranges``, and their values."""
     varying = [part for axis in scene.axes for part in axis.together if part.name not in ranges]
     fixed = {**scene.fixed} | {part.name: part.values[0].item() for part in varying}
-    return {name: fixed[name] for name in scene.system.models[ANALYSIS.name].parameters if name in fixed}
+    return {name: fixed[name] for name in scene.system.models[SOLVES.name].parameters if name in fixed}
 
 
 def _solves(scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.ndarray, options: Mapping) -> Nodes:
@@ -97,8 +97,8 @@ def _solves(scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.nda
     axes = tuple(
         Axis(name, scene.system.parameter(name), None, column) for name, column in zip(names, points.T, strict=True)
     )
-    request = Request(ANALYSIS.default_outputs, next(iter(ANALYSIS.methods)), dict(options))
-    return Nodes(scene.system, ANALYSIS, request, axes, True, fixed)
+    request = Request(SOLVES.default_outputs, next(iter(SOLVES.methods)), dict(options))
+    return Nodes(scene.system, SOLVES, request, axes, True, fixed)
 
 
 class Nodes(Problem):
@@ -107,7 +107,7 @@ class Nodes(Problem):
     @staticmethod
     def find_analysis(name: str) -> Analysis:
         """The analysis of the propagator."""
-        return ANALYSIS
+        return SOLVES
 
 
 class _Answers:
@@ -117,7 +117,7 @@ class _Answers:
         self.values = np.full((count, width), np.nan)
 
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
-        self.values[points] = np.concatenate([results[name] for name in ANALYSIS.default_outputs], axis=1)
+        self.values[points] = np.concatenate([results[name] for name in SOLVES.default_outputs], axis=1)
 
     def lose(self, points: np.ndarray) -> None:
         """Do nothing: missing points are NaN."""

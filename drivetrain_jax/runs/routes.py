@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from drivetrain_jax.analysis import OUTCOME
-from drivetrain_jax.analysis.atlas.solves import PROPAGATOR
+from drivetrain_jax.analysis.atlas.analysis import PROPAGATOR
 from drivetrain_jax.runs.assemble import ResultBuffer, bytes_per_point, labelled
 from drivetrain_jax.runs.growing import NO_REUSE, NotReusable, ReusableResult, ReusedPoints, find, remaining
 from drivetrain_jax.runs.job import Job, Route

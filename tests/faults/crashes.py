@@ -52,7 +52,7 @@ STORE = ["--store", "zarr"]
 # Modules that the commands import late, and that start no thread.
 MODULES = ("matplotlib.pyplot", "xarray", "zarr", "h5netcdf", "diffrax", "drivetrain_jax.systems.cardan")
 MODULES += ("drivetrain_jax.runs.run", "drivetrain_jax.runs.export", "drivetrain_jax.invariants.verify")
-MODULES += ("drivetrain_jax.analysis.floquet.propagator", "drivetrain_jax.analysis.atlas.rules")
+MODULES += ("drivetrain_jax.analysis.floquet.propagator", "drivetrain_jax.analysis.atlas.analysis")
 
 
 def run(name: str, out: str, *more: str) -> list[str]:

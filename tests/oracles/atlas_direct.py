@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drivetrain_jax.analysis import Request, Solver
-from drivetrain_jax.analysis.atlas.solves import ANALYSIS
+from drivetrain_jax.analysis.atlas.analysis import SOLVES
 from drivetrain_jax.analysis.numerics.kernels import compiler_options
 from drivetrain_jax.atlas import StabilityAtlas, floquet_rounds, run, solve_rtol, stability_atlas
 from drivetrain_jax.systems import get_system
@@ -22,13 +22,13 @@ from drivetrain_jax.systems import get_system
 CARDAN = get_system("cardan")
 BASE = dict(CARDAN.presets["base"])
 NAMES = CARDAN.models["floquet"].parameters
-OUTPUTS = ANALYSIS.default_outputs
+OUTPUTS = SOLVES.default_outputs
 _SIZE = 512
 
 
 def direct_solver(rtol: float) -> Solver:
     """The solver of the method ``direct`` for the propagator."""
-    (solver,) = ANALYSIS.solvers(CARDAN, Request(OUTPUTS, "direct", {"rtol": rtol}))
+    (solver,) = SOLVES.solvers(CARDAN, Request(OUTPUTS, "direct", {"rtol": rtol}))
     return solver
 
 

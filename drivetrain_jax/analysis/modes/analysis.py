@@ -1,6 +1,6 @@
 """Natural frequencies and modes of masses joined by springs: values, families, shapes, and modes tracked along an axis.
 
-Frequencies come from singular values (:mod:`singular_values`), modes from singular vectors (:mod:`singular_vectors`) of the
+Frequencies come from singular values, modes from singular vectors (:mod:`singular_values`) of the
 factor ``diag(sqrt k) B M^(-1/2)``. The stiffness matrix is never formed, because it would square the condition.
 """
 
