@@ -81,8 +81,7 @@ def _opened(path: str, grid: Any, solve: bool) -> xr.Dataset:
     from xarray.core import indexing
 
     from drivetrain_jax.analysis import OUTCOME
-    from drivetrain_jax.datasets.grid import grid_values, in_atlas_parameters
-    from drivetrain_jax.datasets.lazy import GAP, AtlasArray, AtlasGrid, whole
+    from drivetrain_jax.datasets.lazy import GAP, AtlasArray, AtlasGrid, grid_values, in_atlas_parameters, whole
     from drivetrain_jax.runs.assemble import to_dataset
     from drivetrain_jax.runs.atlas_chart import in_physical_units
 
