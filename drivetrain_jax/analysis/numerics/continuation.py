@@ -1,6 +1,7 @@
 """Branches of periodic orbits over a parameter, by pseudo-arclength continuation.
 
-A point of a branch is ``x = (y, p)`` with ``F(y; p) = y``, F being the map over one period. Branches run through folds and
+A point of a branch is ``x = (y, p)`` with ``F(y; p) = y``, F being the map over one period (or any map whose fixed points
+are the orbits). Branches run through folds and
 along unstable orbits, and do not end where an orbit loses its stability. Folds (``det(1 - M) = 0``) and period doublings
 (``det(1 + M) = 0``) are located between neighbouring points of a branch. All functions act on lanes: components of x have
 the shape ``(N,)``.
@@ -51,11 +52,11 @@ PeriodMap = Callable[[Array], Mapped]
 
 
 class Branch(NamedTuple):
-    """Points along a branch: ``x`` of shape ``(points, n + 1, N)`` and transition matrices of shape ``(n, n, points, N)``.
-    After the last point of a lane they are NaN."""
+    """Points along a branch: ``x`` of shape ``(points, n + 1, N)`` and transition matrices of shape ``(n, n, points, N)``,
+    if folds and doublings are to be located. After the last point of a lane they are NaN."""
 
     x: Array
-    matrix: Array
+    matrix: Array | None = None
 
 
 class _Solved(NamedTuple):
@@ -139,7 +140,12 @@ def follow(
     first = _on_plane(period_map, x, rise, scale, converged)
     first = first._replace(x=jnp.where(first.change <= closed, first.x.at[-1].set(x[-1]), jnp.nan))
     lanes = jnp.arange(x.shape[1])
-    store = jnp.full((attempts, _row(first).shape[0], x.shape[1]), jnp.nan).at[0].set(_row(first))
+
+    def row(solved: _Solved) -> Array:
+        """The stored values of a point of the branch; the matrix of many states would take much memory."""
+        return jnp.concatenate([solved.x, solved.matrix.reshape(-1, lanes.size)]) if special else solved.x
+
+    store = jnp.full((attempts, *row(first).shape), jnp.nan).at[0].set(row(first))
 
     def step(state: tuple[Array, _Front, Array]) -> tuple[Array, _Front, Array]:
         count, front, store = state
@@ -150,7 +156,7 @@ def follow(
         good &= jnp.sum(there.tangent * front.solved.tangent, axis=0) > _LEAST_COSINE
         good &= (front.length <= _FINE * longest) | _straight(front, there) | (not special)
         front = _moved(front, there, good, longest, limits)
-        return count + 1, front, store.at[front.number, :, lanes].set(_row(front.solved).T)
+        return count + 1, front, store.at[front.number, :, lanes].set(row(front.solved).T)
 
     def unfinished(state: tuple[Array, _Front, Array]) -> Array:
         return (state[0] < attempts) & jnp.any(_going(state[1], limits))
@@ -165,12 +171,7 @@ def follow(
     *_, store = jax.lax.while_loop(unfinished, step, (jnp.asarray(1), begin, store))
     n = x.shape[0] - 1
     matrix = jnp.moveaxis(store[:, n + 1 :], 1, 0)
-    return Branch(store[:, : n + 1], matrix.reshape(n, n, *matrix.shape[1:]))
-
-
-def _row(solved: _Solved) -> Array:
-    """The stored values of a point of a branch, ``(n + 1 + n^2, N)``."""
-    return jnp.concatenate([solved.x, solved.matrix.reshape(-1, solved.x.shape[1])])
+    return Branch(store[:, : n + 1], matrix.reshape(n, n, *matrix.shape[1:]) if special else None)
 
 
 def _going(front: _Front, limits: tuple[Array | float, Array | float]) -> Array:
@@ -272,7 +273,7 @@ def folds_and_doublings(
     ``map_of(index)`` is the period map of the lanes ``index``. The second result, ``(N,)``, is true if all were located, and
     there are no others.
     """
-    tests = _tests(found.matrix)
+    tests = _tests(found.matrix)  # pyright: ignore[reportArgumentType]
     changes = (tests[:, 1:] * tests[:, :-1] < 0).transpose(1, 0, 2)
     lanes = changes.shape[2]
 
