@@ -18,33 +18,43 @@ FIRST_FAILURE = 2
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a system, or an option of an analysis.
+    """A parameter of a system, or an option of an analysis. A number may be given as a text with a unit."""
 
-    Required if ``default`` is None, unless ``derived`` names the parameters it follows from; the model then computes it.
-    ``lower`` and ``upper`` are inclusive unless the matching ``open_*`` flag is set; ``infinite`` admits infinity. The
-    value is one of the words ``choices``, any word (``text``), a list of numbers in the range (``listed``, default ``()``:
-    none), or, with ``broadcast``, also one number for all entries. ``symbol`` is its form in formulas.
-    With ``or_zero`` 0 is allowed below ``lower``. Values above ``usual`` are warned of, because they were probably meant in
-    mm. A number may be a text with a unit.
-    """
-
+    #: Name in scenes and of the field.
     name: str
+    #: Unit of the values; ``1``: none.
     units: str
+    #: One line about the parameter.
     long_name: str
+    #: Value if none is given. None: required, unless ``derived`` names the parameters it follows from.
     default: float | int | str | tuple[float, ...] | None = None
+    #: Names of the parameters from which the model computes a value that is not given.
     derived: str = ""
+    #: Smallest value, inclusive unless ``open_lower``.
     lower: float = -math.inf
+    #: Largest value, inclusive unless ``open_upper``.
     upper: float = math.inf
+    #: ``lower`` itself is not allowed.
     open_lower: bool = False
+    #: ``upper`` itself is not allowed.
     open_upper: bool = False
+    #: The allowed words, if the value is a word.
     choices: tuple[str, ...] = ()
+    #: A list of numbers in the range (default ``()``: none).
     listed: bool = False
+    #: For a list, also one number for all entries.
     broadcast: bool = False
+    #: An integer.
     integer: bool = False
+    #: Infinity is allowed.
     infinite: bool = False
+    #: Any word.
     text: bool = False
+    #: Form in formulas.
     symbol: str = ""
+    #: Values above are warned of, because they were probably meant in mm.
     usual: float = math.inf
+    #: 0 is allowed below ``lower``.
     or_zero: bool = False
 
     @property

@@ -59,27 +59,30 @@ class Request:
 class Solver:
     """One way to compute the requested results of one point.
 
-    ``solve(values, effort)`` returns every requested variable and ``outcome``, with the lanes as LAST axis. ``values``
-    holds all parameters of the model: varying ones as JAX arrays of lanes ``(N,)``, the others as numbers.
-    :func:`~drivetrain_jax.analysis.numerics.lanes.over_lanes` makes a ``solve`` from a function of one point. A path axis
-    is a NumPy array ``(L,)``; results then have the path as FIRST axis, and ``chunk`` counts lines.
-
-    The argument ``effort`` of ``solve`` is a traced integer, the largest ``effort(columns)`` in the batch.
-    ``effort(columns)`` returns a number of steps for NumPy arrays ``(N,)``; by default it is equal for all points. The
-    engine assigns every point to the solver with the smallest ``effort * unit_cost``, and runs batches of ``chunk`` points
-    of similar effort. ``steps(values)`` predicts the effort of every lane from traced values, if ``solve`` uses it.
-    ``march`` marks integrations in time, ``short_loops`` loops over some tens of lanes; both select other compiler options
-    (``numerics.kernels.compiler_options``). One point of a ``lengthy`` solver takes as long as a compilation.
+    The engine assigns every point to the solver with the smallest ``effort * unit_cost``, and runs batches of ``chunk``
+    points of similar effort.
     """
 
+    #: Name in logs and tests.
     name: str
+    #: ``solve(values, effort)``: every requested variable and ``outcome``, with the lanes as LAST axis. ``values`` holds all
+    #: parameters of the model: varying ones as JAX arrays of lanes ``(N,)``, the others as numbers. ``effort`` is a traced
+    #: integer, the largest ``effort(columns)`` in the batch. A path axis is a NumPy array ``(L,)``; results then have the
+    #: path as FIRST axis. :func:`~drivetrain_jax.analysis.numerics.lanes.over_lanes` makes it from a function of one point.
     solve: Callable[[Mapping[str, Any], Array], dict[str, Array]]
+    #: ``effort(columns)``: number of steps for NumPy arrays ``(N,)``; equal for all points by default.
     effort: Callable[[Mapping[str, np.ndarray]], np.ndarray] = lambda columns: np.ones(())
+    #: ``steps(values)``: predicted effort of every lane from traced values, if ``solve`` uses its effort.
     steps: Callable[[Mapping[str, Any]], Array] | None = None
+    #: Cost of a step, relative to the other solvers.
     unit_cost: float = 1.0
+    #: Points of a batch; lines if there is a path axis.
     chunk: int = 256
+    #: Integrations in time, which need other compiler options (``numerics.kernels.compiler_options``).
     march: bool = False
+    #: Loops over some tens of lanes, which need other compiler options.
     short_loops: bool = False
+    #: One point takes as long as a compilation.
     lengthy: bool = False
 
 
@@ -144,41 +147,49 @@ def forward_derivatives(
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """Named results, methods and solvers.
+    """Named results, methods and solvers: the one record of an analysis.
 
-    ``methods`` maps each method to the names of its options, the default method first; ``options`` describes the options
-    and ``method_titles`` the methods. ``solvers(system, request)`` returns the candidates of the requested method.
-    ``dimensions(system, request, fixed)`` describes the dimensions of the results besides those of the sweep; ``fixed``
-    holds the parameters that do not vary (a list is complete even if one entry varies). ``dimensions`` raises
-    :class:`~drivetrain_jax._errors.InputError` if request and parameters do not match. ``lacks(system)`` maps the results
-    and methods that a system does not support to the reason. ``derivatives(system, request, parameters, constants,
-    results)`` returns Jacobians ``(..., P)`` of differentiable results at one point with respect to all P ``parameters``
-    (arrays; ``constants`` hold the rest); ``results`` include ``derivative_outputs(outputs)``. ``path_axis(system,
-    request)`` names the axis that is computed as a whole, if any. A ``continuous`` analysis accepts ranges for axes and
-    returns a function of the parameters instead of values on a grid. ``of_system(system)`` returns the fields that depend
-    on the system, by name, for example its ``variables``. ``uses`` names another analysis whose models this analysis
-    works with, so that systems need no model for it. ``patience`` names the option that limits an iteration: a larger
-    value may help a point that has not converged. ``undecided`` says what may decide an undecided verdict, with options in
-    braces.
+    Figures and rules of an analysis are registered by its name, because they are used without jax.
     """
 
+    #: Name in scenes and of the function, ``floquet``.
     name: str
+    #: One line about the analysis.
     title: str
+    #: All results; an analysis that has the results of its systems gives them in ``of_system``.
     variables: tuple[Variable, ...]
+    #: Names of the results that are computed if a request names none.
     default_outputs: tuple[str, ...]
+    #: The names of the options of each method; the first method is the default.
     methods: Mapping[str, tuple[str, ...]]
+    #: The options of all methods.
     options: tuple[Parameter, ...]
+    #: ``solvers(system, request)``: the candidates for the requested method.
     solvers: Callable[[type[System], Request], tuple[Solver, ...]]
+    #: ``dimensions(system, request, fixed)``: the dimensions of the results besides those of the sweep. ``fixed`` holds the
+    #: parameters that do not vary (a list is complete even if one entry varies). Raises ``InputError`` if request and
+    #: parameters do not match.
     dimensions: Callable[[type[System], Request, Mapping[str, Any]], tuple[Dimension, ...]] = lambda *_: ()
+    #: ``lacks(system)``: the reason for each result and method that the system does not support.
     lacks: Callable[[type[System]], Mapping[str, str]] = lambda _: {}
+    #: ``path_axis(system, request)``: the axis that is computed as a whole, if any.
     path_axis: Callable[[type[System], Request], str | None] = lambda *_: None
+    #: ``derivatives(system, request, parameters, constants, results)``: Jacobians ``(..., P)`` of differentiable results at
+    #: one point by all P ``parameters`` (arrays; ``constants`` hold the rest). ``results`` include ``derivative_outputs``.
     derivatives: Callable[..., Mapping[str, Array]] | None = None
+    #: ``derivative_outputs(outputs)``: results that ``derivatives`` needs besides the requested ones.
     derivative_outputs: Callable[[tuple[str, ...]], tuple[str, ...]] = lambda _: ()
+    #: The analysis accepts ranges for axes, and returns a function of the parameters instead of values on a grid.
     continuous: bool = False
+    #: One line about each method.
     method_titles: Mapping[str, str] = field(default_factory=dict)
+    #: ``of_system(system)``: the fields that depend on the system, by name, for example its ``variables``.
     of_system: Callable[[type[System]], Mapping[str, Any]] = lambda _: {}
+    #: Another analysis whose models this analysis works with, so that systems need no model for it.
     uses: str = ""
+    #: The option that limits an iteration: a larger value may help a point that has not converged.
     patience: str = ""
+    #: What may decide an undecided verdict, with options in braces.
     undecided: str = ""
 
     def __post_init__(self) -> None:

@@ -210,22 +210,22 @@ _DATA = (Complex, Decimal, str, bytes, list, tuple, dict, set, PathLike)
 
 @dataclass(frozen=True)
 class Model:
-    """The service of a system for one analysis: ``build(values)`` returns the model from the values of ``parameters``.
+    """The service of a system for one analysis."""
 
-    ``check(fixed)`` raises ``ValueError`` with one line, ``name = value: allowed is ...``, if parameters in range do
-    not match each other. ``fixed`` holds the values that do not vary, and a whole list even if one of its entries
-    varies. ``smooth`` declares the coordinates of an atlas. None: the parameters themselves, and an atlas only on
-    request (``method = "auto"`` makes none). ``results`` declares the variables of an analysis whose results are the
-    system's own (``parameters``), and ``default_outputs`` names those computed by default (empty: all). ``returns`` is
-    the class of the model if it is not the usual one of the analysis (``history``: a flow).
-    """
-
+    #: ``build(values)``: the model, from the values of ``parameters``.
     build: Callable[[Values], Any]
+    #: Names of the parameters that the model uses.
     parameters: tuple[str, ...]
+    #: ``check(fixed)`` raises ``ValueError`` with one line, ``name = value: allowed is ...``, if parameters in range do not
+    #: match each other. ``fixed`` holds the values that do not vary, and a whole list even if one of its entries varies.
     check: Callable[[Values], None] | None = None
+    #: Coordinates of an atlas. None: the parameters, and an atlas only on request (``method = "auto"`` makes none).
     smooth: Smoothness | None = None
+    #: Variables of an analysis whose results are the system's own (``parameters``).
     results: tuple[Variable, ...] = ()
+    #: Names of those ``results`` that are computed by default; empty: all.
     default_outputs: tuple[str, ...] = ()
+    #: Class of the model if it is not the usual one of the analysis (``history``: a flow).
     returns: type | None = None
 
 
@@ -271,33 +271,39 @@ class System(eqx.Module):
     Concrete values are checked against their ranges: :class:`~drivetrain_jax.InputError` names the first one out of range.
     Traced values are not checked.
 
-    Class attributes: ``name``, ``title`` and ``source``; ``presets``, named parameter sets of the source; ``resonances``,
-    the predicted ones; ``time_units``, the unit of time in its equations (``1``: nondimensional); ``periods_per_turn``, the
-    number of their periods in a turn of the shaft (0: unknown); ``physical``, the physical data that parameters follow from,
-    None without any; ``roles``, the names of the parameters that analyses and
-    figures ask for, see below; ``state``, the components of its state, and ``displacements``, the dimension of those whose
-    amplitudes ``forced`` reports; ``mode_families``, names of the families of ``modes`` by their codes. ``parameters`` and
-    ``models`` follow from fields and methods. A model for ``atlas`` without one for ``floquet``, or for ``history`` or
-    ``forced`` without ``state``, raises ``ValueError``.
-
-    Roles: ``speed`` (or excitation frequency), which figures draw horizontally and which is the path of
-    ``frequency_response``; ``angle`` and ``damping`` of design questions; ``initial_displacement`` and ``initial_rate`` of
-    ``steady_state`` and ``history``; ``half_play`` and ``planets``, the angles of the planets, of figures.
+    A model for ``atlas`` without one for ``floquet``, or for ``history`` or ``forced`` without ``state``, raises
+    ``ValueError``.
     """
 
+    #: Name in scenes, ``cardan``.
     name: ClassVar[str]
+    #: One line about the system.
     title: ClassVar[str]
+    #: The publication.
     source: ClassVar[str] = ""
+    #: Named parameter sets of the source.
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({})
+    #: Predicted resonances.
     resonances: ClassVar[Resonances | None] = None
+    #: Unit of time in the equations; ``1``: nondimensional.
     time_units: ClassVar[str] = "1"
+    #: Periods of the equations in a turn of the shaft; 0: unknown.
     periods_per_turn: ClassVar[int] = 0
+    #: Physical data that parameters follow from.
     physical: ClassVar[PhysicalData | None] = None
+    #: Names of the parameters that analyses and figures ask for. ``speed`` (or excitation frequency): horizontal axis of
+    #: figures and path of ``frequency_response``; ``angle`` and ``damping``: design questions; ``initial_displacement`` and
+    #: ``initial_rate``: ``steady_state`` and ``history``; ``half_play`` and ``planets`` (their angles): figures.
     roles: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    #: Components of the state.
     state: ClassVar[tuple[Component, ...]] = ()
+    #: Dimension of the components of the state whose amplitudes ``forced`` reports.
     displacements: ClassVar[Dimension | None] = None
+    #: Names of the families of ``modes`` by their codes.
     mode_families: ClassVar[tuple[str, ...]] = ()
+    #: The parameters, which follow from the fields.
     parameters: ClassVar[tuple[Parameter, ...]] = ()
+    #: The models by analysis, which follow from the methods marked with :func:`serves`.
     models: ClassVar[dict[str, Model]] = {}
 
     def __init_subclass__(cls, **more: Any) -> None:
