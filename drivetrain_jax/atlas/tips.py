@@ -180,12 +180,10 @@ def find_tips(atlas: Atlas, system: type[System], *, opening: bool = True) -> Ti
     return Tips(_sorted(chosen, atlas, horizontal), undecided, searches)
 
 
-def polish(
-    criteria: Criteria, x: np.ndarray, kind: str, horizontal: int, steps: int = _POLISH
-) -> tuple[np.ndarray, Growth]:
+def polish(criteria: Criteria, x: np.ndarray, kind: str, horizontal: int) -> tuple[np.ndarray, Growth]:
     """Newton's method for ln|sigma| = 0 and its derivative along ``horizontal``, from ``x`` ``(N, 2)``."""
     kinds = [kind] * len(x)
-    for _ in range(steps if len(x) else 0):
+    for _ in range(_POLISH if len(x) else 0):
         rates = growth(criteria, x, kinds, second=True)
         jacobian = np.stack([rates.gradient, rates.hessian[:, horizontal]], axis=1)
         residual = np.stack([rates.rate, rates.gradient[:, horizontal]], axis=-1)

@@ -69,12 +69,11 @@ _PLANET_PARTS[1, 2:, 1] = -1.0
 _PLANET_PARTS[2, 2, 0], _PLANET_PARTS[2, 3, 0] = 1.0, -1.0
 
 
-def spacing(planet_angle: Any, order: int = 1) -> Any:
-    """``c1 = |sum e^(i psi)| / N`` (``c2`` with ``order`` 2): zero if rotation and translation are uncoupled."""
-    angles = [order * angle for angle in planet_angle]
-    module = np if all(isinstance(angle, (int, float)) for angle in angles) else jnp
-    count = len(angles)
-    return module.hypot(sum(module.cos(a) for a in angles) / count, sum(module.sin(a) for a in angles) / count)
+def spacing(planet_angle: Any) -> Any:
+    """``c1 = |sum e^(i psi)| / N``: zero if rotation and translation are uncoupled."""
+    module = np if all(isinstance(angle, (int, float)) for angle in planet_angle) else jnp
+    x, y = (sum(function(angle) for angle in planet_angle) for function in (module.cos, module.sin))
+    return module.hypot(x, y) / len(planet_angle)
 
 
 def _lanes(*arrays: Any) -> tuple[int, ...]:

@@ -148,9 +148,9 @@ def test_shafts(monkeypatch, tally, compilations, tmp_path):
     """Evaluations of the characteristic function, kernels, and the size of the file."""
     plain = shaft_roots.characteristic
 
-    def counted(shaft, q, counting=True):
+    def counted(shaft, q):
         tally(jnp.int64(q.size))
-        return plain(shaft, q, counting)
+        return plain(shaft, q)
 
     monkeypatch.setattr(shaft_roots, "characteristic", counted)
     first = dt.run(SCENES["bicardan"], out=tmp_path / "first.nc", threads=1)

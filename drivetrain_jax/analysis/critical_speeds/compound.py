@@ -51,10 +51,10 @@ _MAX_LEVELS = 22
 
 class Value(NamedTuple):
     """The characteristic function at one q, ``psi`` in [-1, 1] (``u4`` over the norm of ``u``), and the number
-    ``count`` of natural frequencies below, zero modes included (None unless asked for)."""
+    ``count`` of natural frequencies below, zero modes included."""
 
     psi: Array
-    count: Array | None  # pyright: ignore[reportIncompatibleMethodOverride]
+    count: Array  # pyright: ignore[reportIncompatibleMethodOverride]
 
 
 class _State(NamedTuple):
@@ -63,7 +63,7 @@ class _State(NamedTuple):
     count: Array  # pyright: ignore[reportIncompatibleMethodOverride]
 
 
-def characteristic(shaft: Shaft, q: Array, counting: bool = True) -> Value:
+def characteristic(shaft: Shaft, q: Array) -> Value:
     """The characteristic function at ``q = sqrt(p)``, ``p`` in rad/s.
 
     ``q`` has shape ``(..., *lanes)`` and the fields of ``shaft`` ``(n, *lanes)``; results have the shape of ``q``.
@@ -77,16 +77,15 @@ def characteristic(shaft: Shaft, q: Array, counting: bool = True) -> Value:
         u, sign, count = _enter(state, segment, q)
         functions = functions_of(segment, q)
         behind = functions.propagate(u)
-        if counting:
-            clamped, sign_q = clamped_count(segment, functions, q)
-            positive = sign_of(behind[0])
-            count = count + clamped + _negative(positive * sign * sign_q, _trace(u, sign, functions, sign_q))
-            sign = positive
+        clamped, sign_q = clamped_count(segment, functions, q)
+        positive = sign_of(behind[0])
+        count = count + clamped + _negative(positive * sign * sign_q, _trace(u, sign, functions, sign_q))
+        sign = positive
         size = _size(behind)
         return _State(_out_of(tuple(x / size for x in behind), segment), sign, count), None
 
     state, _ = jax.lax.scan(step, start, segments)
-    return _end(state, last, q, counting)
+    return _end(state, last, q)
 
 
 def pairings(shaft: Shaft, q: Array) -> Array:
@@ -208,7 +207,7 @@ def _across_hinge(u: Plane, k_hinge: Array, unit: Array, q: Array) -> Plane:
     return keep * u0 + add * u1, keep * u1, keep * u2, keep * u3 + add * u4, keep * u4
 
 
-def _end(state: _State, last: LastNode, q: Array, counting: bool) -> Value:
+def _end(state: _State, last: LastNode, q: Array) -> Value:
     """Psi behind the last node, and the inertia of the last pivot, which is S itself."""
     e1, e3 = last.e1, last.e3
     u0, u1, u2, u3, u4 = u = _across_support(state.u, last.k, last.m, last.unit, q)
@@ -216,10 +215,7 @@ def _end(state: _State, last: LastNode, q: Array, counting: bool) -> Value:
     size = jnp.sqrt(u0**2 + (u1 / e1) ** 2 + (u2**2 / (e1 * e3)) + (u3 / e3) ** 2 + (u4 / (e1 * e3)) ** 2)
     _, u1, _, u3, u4 = _across_rotation(u, last.k_rot, last.inertia, e1, q)
     u1, u3, u4 = u1 / e1, u3 / e3, u4 / (e1 * e3)
-    psi = u4 / size
-    if not counting:
-        return Value(psi, None)
-    return Value(psi, state.count + _negative(sign_of(u4) * state.sign, (u1 + u3) * state.sign))
+    return Value(u4 / size, state.count + _negative(sign_of(u4) * state.sign, (u1 + u3) * state.sign))
 
 
 def clamped_count(segment: Segment, functions: Compound | General, q: Array) -> tuple[Array, Array]:

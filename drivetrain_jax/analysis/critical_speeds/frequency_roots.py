@@ -115,10 +115,10 @@ def _step(shaft: Shaft, index: Array, b: _Brackets) -> _Brackets:
     q = _trial(b)
     # Computed once for all uses: near a root two kernels may round to different counts, and the ends would contradict.
     value = stored(characteristic)(shaft, q)
-    above = value.count >= index  # pyright: ignore[reportOptionalOperand]
+    above = value.count >= index
     shrink = jnp.where((b.low == 0) & above, b.shrink * b.shrink, b.shrink)
     low, high = jnp.where(above, b.low, q), jnp.where(above, q, b.high)
-    count_low, count_high = jnp.where(above, b.count_low, value.count), jnp.where(above, value.count, b.count_high)  # pyright: ignore[reportArgumentType]
+    count_low, count_high = jnp.where(above, b.count_low, value.count), jnp.where(above, value.count, b.count_high)
     psi_low, psi_high = jnp.where(above, b.psi_low, value.psi), jnp.where(above, value.psi, b.psi_high)
     isolated = (count_high - count_low == 1) & (high <= _NEAR * low) & (psi_low * psi_high < 0)
     first_width = jnp.where(isolated & ~b.isolated, high - low, b.first_width)
@@ -226,7 +226,7 @@ def _multiple(shaft: Shaft, q: Array) -> Array:
     near = q[1:] - q[:-1] <= _MULTIPLE * q[1:]
     none = jnp.zeros_like(q[:1], bool)
     above = jnp.where((q[-1:] > 0) & jnp.isfinite(q[-1:]), q[-1:] * (1 + _MULTIPLE), 1.0)
-    beyond = (q[-1:] > 0) & (characteristic(shaft, above).count > len(q))  # pyright: ignore[reportOptionalOperand]
+    beyond = (q[-1:] > 0) & (characteristic(shaft, above).count > len(q))
     return jnp.concatenate([none, near]) | jnp.concatenate([near, beyond])
 
 
@@ -328,5 +328,5 @@ def krylov_roots(shaft: Shaft, modes: int) -> Roots:
     q = jnp.where(wanted <= 0, 0.0, jnp.where(found, 0.5 * (low + high), jnp.nan))
     safe = jnp.where(q > 0, q, 1.0)
     below, above = (characteristic(shaft, safe * (1 + shift)).count for shift in (-_APART, _APART))
-    certified = (wanted <= 0) | (found & (below < index) & (above >= index))  # pyright: ignore[reportOptionalOperand]
+    certified = (wanted <= 0) | (found & (below < index) & (above >= index))
     return Roots(q, jnp.where(q > 0, 2 * (high - low) / safe, 0.0), certified)
