@@ -118,7 +118,7 @@ def frequency_response(system: System, *, outputs: Sequence[str] | None = None, 
 
     ``Cardan``: branches of the forced orbit along ``system.Omega``, ``branch_amplitude`` (L, 7, 2) and so on. Args as of
     :func:`floquet`; the frequencies are concrete numbers. Options ``method`` ("exact", "harmonic_balance",
-    "multiple_scales", "averaging", "describing_function"). No derivatives.
+    "multiple_scales", "describing_function"). No derivatives.
 
     >>> import drivetrain_jax as dt, numpy as np
     >>> gears = dt.Rattle(omega=np.linspace(0.5, 0.9, 3), **dt.Rattle.presets["table1"])

@@ -183,6 +183,8 @@ class Analysis:
     continuous: bool = False
     #: One line about each method.
     method_titles: Mapping[str, str] = field(default_factory=dict)
+    #: Methods by their other names.
+    aliases: Mapping[str, str] = field(default_factory=dict)
     #: ``of_system(system)``: the fields that depend on the system, by name, for example its ``variables``.
     of_system: Callable[[type[System]], Mapping[str, Any]] = lambda _: {}
     #: Another analysis whose models this analysis works with, so that systems need no model for it.

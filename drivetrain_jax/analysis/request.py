@@ -132,6 +132,8 @@ def _method_and_options(
 ) -> tuple[str, dict[str, Any]]:
     methods = [name for name in analysis.methods if name not in lacking]
     method = given.pop("method", next(iter(analysis.methods)))
+    if isinstance(method, str):
+        method = analysis.aliases.get(method, method)
     if not isinstance(method, str) or method not in analysis.methods:
         raise InputError(f"options.method = {shown(method)}: unknown{nearest(str(method), methods)}")
     used = analysis.methods[method]

@@ -59,7 +59,7 @@ def test_sweeps_and_branches_pass_through_the_steady_states():
     assert (abs(swept.branch_u_max - steady.u_max).min("branch") < 1e-9).all() and not swept.outcome.any()
 
 
-@pytest.mark.parametrize("method", ["harmonic_balance", "multiple_scales", "averaging", "describing_function"])
+@pytest.mark.parametrize("method", ["harmonic_balance", "multiple_scales", "describing_function"])
 def test_approximations_refuse_it(method):
     scene = {"system": "rattle", "analysis": "frequency_response", "options": {"method": method}}
     scene |= {"axes": {"omega": {"values": [0.7, 0.8]}}, "fixed": {**TABLE, "damping": "contact"}}

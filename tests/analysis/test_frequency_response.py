@@ -134,7 +134,7 @@ def test_a_range_that_is_given_is_kept():
 @pytest.mark.parametrize(
     ("method", "output", "allowed"),
     [
-        ("exact", "peak_frequency", "multiple_scales, averaging, describing_function"),
+        ("exact", "peak_frequency", "multiple_scales, describing_function"),
         ("harmonic_balance", "fit_range", "multiple_scales"),
         ("describing_function", "period_multiple", "exact"),
     ],

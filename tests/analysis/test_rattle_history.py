@@ -163,7 +163,7 @@ def test_the_slow_flow_settles_at_the_response(sign):
 
 @pytest.mark.full
 def test_averaging_gives_the_equations_of_multiple_scales():
-    """(59), (60) averaged by quadrature over the fast phase are (42), (43), and both methods give the same numbers."""
+    """(59), (60) averaged by quadrature over the fast phase are (42), (43), and `averaging` is `multiple_scales`."""
     model = dt.Rattle(**GEARS).oscillator()
     reach = jnp.asarray(1.0)
     flow, w0 = averaged_flow(model, reach, jnp.asarray(0.1), jnp.asarray(0.0))
@@ -178,13 +178,8 @@ def test_averaging_gives_the_equations_of_multiple_scales():
         turned = complex(*map(float, rates)) * np.exp(-1j * beta)
         np.testing.assert_allclose([turned.real, turned.imag / a], [slow_a, slow_beta], atol=1e-14)
     scene = {"system": "rattle", "analysis": "frequency_response", "fixed": TABLE1}
-    scene |= {"outputs": ["u_max", "phase", "peak_frequency", "fold_frequency", "fit_range"]}
-    one, two = (
-        dt.run(scene | {"axes": {"omega": {"values": [0.7, 0.86, 0.9]}}, "options": {"method": method}})
-        for method in ("averaging", "multiple_scales")
-    )
-    for name in scene["outputs"]:
-        np.testing.assert_array_equal(one[name], two[name])
+    found = dt.run(scene | {"axes": {"omega": {"values": [0.7, 0.9]}}, "options": {"method": "averaging"}})
+    assert found.attrs["method"] == "multiple_scales"
 
 
 @pytest.mark.parametrize(

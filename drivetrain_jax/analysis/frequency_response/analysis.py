@@ -93,11 +93,10 @@ METHODS = {
     "exact": ("rtol", "most_periods"),
     "harmonic_balance": ("harmonics", "subharmonic", "samples"),
     "multiple_scales": ("fit_range",),
-    "averaging": ("fit_range",),
     "describing_function": (),
 }
 # Results that not every method provides.
-_CLOSED = ("multiple_scales", "averaging", "describing_function")
+_CLOSED = ("multiple_scales", "describing_function")
 _APPROXIMATE = ("harmonic_balance", *_CLOSED)
 _ONLY = {
     **dict.fromkeys(("period_multiple", "state_error"), ("exact",)),
@@ -105,7 +104,7 @@ _ONLY = {
     "residual": _APPROXIMATE,
     "fold_frequency": ("exact", *_CLOSED),
     **dict.fromkeys(("peak_amplitude", "peak_frequency", "backbone_amplitude"), _CLOSED),
-    "fit_range": ("multiple_scales", "averaging"),
+    "fit_range": ("multiple_scales",),
 }
 # Closed forms of curves whose drive has one amplitude.
 _OF_ONE_DRIVE = frozenset(("peak_amplitude", "peak_frequency", "fold_frequency"))
@@ -262,10 +261,10 @@ ANALYSIS = Analysis(
     method_titles={
         "exact": "exact motion from impact to impact, followed along the path",
         "harmonic_balance": "a chosen number of harmonics",
-        "multiple_scales": "closed form for a cubic spring, as published",
-        "averaging": "the same closed form: averaging gives the equation of multiple scales",
+        "multiple_scales": "closed form for a cubic spring, as published; also called averaging",
         "describing_function": "bias and fundamental alone",
     },
+    aliases={"averaging": "multiple_scales"},
     options=OPTIONS,
     patience="most_periods",
     solvers=_solvers,

@@ -214,10 +214,7 @@ def phase_lag(flow: SlowFlow, omega: Array, amplitude: Array) -> Array:
 
 
 FOLDS = 4
-BRANCHES = {
-    **dict.fromkeys(("multiple_scales", "averaging"), MOST_ROOTS),
-    "describing_function": describing_function.MOST_ROOTS,
-}
+BRANCHES = {"multiple_scales": MOST_ROOTS, "describing_function": describing_function.MOST_ROOTS}
 _SAMPLES = 128
 _LARGEST_STEP, _MOST_PARTS = 0.005, 16
 
