@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.2.0"
 
+# Modules of the names; all others are functions of `analyses`.
 _HOME = {
     "datasets.figure": ("plot",),
     "runs.atlas_file": ("open_atlas",),
@@ -57,19 +58,6 @@ _HOME = {
     "systems.rattle": ("Rattle",),
     "systems.tripod": ("Tripod",),
     "functions": ("Result",),
-    "analyses": (
-        "basins",
-        "critical_speeds",
-        "floquet",
-        "forced",
-        "frequency_response",
-        "harmonic_response",
-        "history",
-        "lyapunov",
-        "modes",
-        "poincare",
-        "steady_state",
-    ),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 
@@ -106,9 +94,9 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULE:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULE[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_MODULE.get(name, 'analyses')}"), name)
 
 
 def __dir__() -> list[str]:

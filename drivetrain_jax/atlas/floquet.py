@@ -17,8 +17,7 @@ from drivetrain_jax._machine import usable_cores
 from drivetrain_jax._threads import threads
 from drivetrain_jax.analysis.floquet.effort import stable_steps, steps_needed
 from drivetrain_jax.analysis.floquet.power_series import propagators_along
-from drivetrain_jax.analysis.numerics.kernels import compiler_options
-from drivetrain_jax.analysis.numerics.predictions import Words, predicted, split
+from drivetrain_jax.analysis.numerics.kernels import Words, compiler_options, predicted, split
 from drivetrain_jax.atlas.construction import MAX_SOLVES, Domain, Rounds, construct
 from drivetrain_jax.atlas.panels import Atlas, Panel
 from drivetrain_jax.atlas.quantity import floquet_quantity

@@ -35,7 +35,7 @@ function keptPlaces(bits, first, degrees) {
   return { count, places };
 }
 
-/** The atlas of the page's data (explore/page.py). */
+/** The atlas of the page's data (explore/__init__.py). */
 export function openAtlas(data) {
   const m = data.size * data.size, all = decode(data.coefficients), bits = bytesOf(data.kept);
   let bit = 0, used = 0;

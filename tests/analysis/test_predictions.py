@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivetrain_jax.analysis.numerics import predictions
-from drivetrain_jax.analysis.numerics.predictions import predicted
+from drivetrain_jax.analysis.numerics import kernels
+from drivetrain_jax.analysis.numerics.kernels import predicted
 
 
 def powers(exponents, values):
@@ -35,7 +35,7 @@ def test_compiled_once_for_all_numbers_and_again_for_other_words():
         traced.append(values["kind"])
         return values["a"] * values["x"]
 
-    predictions._compiled.cache_clear()
+    kernels._compiled.cache_clear()
     for a in (1.0, 2.0):
         for count in (7, 9):
             x = np.arange(count) + 1.0

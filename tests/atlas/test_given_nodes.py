@@ -11,7 +11,7 @@ import pytest
 
 from drivetrain_jax.analysis.floquet.effort import steps_needed
 from drivetrain_jax.analysis.floquet.power_series import propagators_along
-from drivetrain_jax.analysis.numerics.predictions import predicted
+from drivetrain_jax.analysis.numerics.kernels import predicted
 from drivetrain_jax.atlas import Domain, Quantity, construct, run, values_at
 from drivetrain_jax.atlas import floquet as series_module
 from drivetrain_jax.atlas.floquet import floquet_domain, series_nodes

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.numerics.predictions import Words, count_of, predicted, split
+from drivetrain_jax.analysis.numerics.kernels import Words, count_of, predicted, split
 from drivetrain_jax.systems import System
 
 if TYPE_CHECKING:

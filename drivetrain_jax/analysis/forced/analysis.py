@@ -42,9 +42,9 @@ from drivetrain_jax.analysis.forced.orbit import (
     transition,
 )
 from drivetrain_jax.analysis.forced.response_derivatives import periodic_slopes
+from drivetrain_jax.analysis.numerics.kernels import predicted
 from drivetrain_jax.analysis.numerics.lanes import Constants, over_lanes
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, solve, spectral_norm
-from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.systems import ForcedModel, System
 
 LINEAR = ("periodic_state", "periodic_state_error", "amplitude", "amplitude_phase", "condition")

@@ -35,8 +35,8 @@ from drivetrain_jax.analysis._base import (
 )
 from drivetrain_jax.analysis.history import piecewise
 from drivetrain_jax.analysis.history.integration import NUM, has_finite_start, integrated, limits_of, requested_times
+from drivetrain_jax.analysis.numerics.kernels import predicted
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
-from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.systems import Flow, PiecewiseLinearOscillator, System
 
 

@@ -39,9 +39,8 @@ from drivetrain_jax.analysis.impacts.piecewise_march import (
     prepare,
     start,
 )
-from drivetrain_jax.analysis.numerics.kernels import stored
+from drivetrain_jax.analysis.numerics.kernels import predicted, stored
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
-from drivetrain_jax.analysis.numerics.predictions import predicted
 from drivetrain_jax.systems import Flow, PiecewiseLinearOscillator, System
 
 # States at given times and events of a motion of a piecewise linear oscillator from any start, exact up to rounding.

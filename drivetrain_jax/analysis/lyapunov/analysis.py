@@ -53,7 +53,7 @@ from drivetrain_jax.analysis.lyapunov.variational import (
     needed_steps,
 )
 from drivetrain_jax.analysis.lyapunov.verdict import Evidence, Verdict, follows, judge
-from drivetrain_jax.analysis.numerics.predictions import predicted
+from drivetrain_jax.analysis.numerics.kernels import predicted
 from drivetrain_jax.systems import Flow, System
 
 # Limits on the work of a run, and groups of members that need a similar number of steps.
