@@ -20,11 +20,11 @@ from drivetrain_jax.systems import System
 
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "numpy", "scipy")
 _ROOT = Path(drivetrain_jax.__file__).parent
-# Folders and files of this package that compute numbers, and files in these folders that only read results.
-_FOLDERS = ("resonances", "systems", "analysis", "atlas")
+# Folders and files of this package that compute numbers, and the files in these folders that only read results.
+_FOLDERS = ("systems", "analysis", "atlas")
 _ENGINE = ("atlas_choice", "kernel", "over", "plan", "point_grid", "rounds", "through_atlas")
-_FILES = ("_quantities", "store/shards", *(f"runs/{name}" for name in _ENGINE))
-_READERS = ("figure.py", "rules.py")
+_FILES = ("_quantities", "resonances", "store/shards", *(f"runs/{name}" for name in _ENGINE))
+_READER = "figure.py"
 
 
 def numerics_of(system: type[System], analysis: Analysis, route: str) -> dict[str, Any]:
@@ -72,7 +72,7 @@ def _own_sources() -> dict[str, str]:
     """Digests of the numeric code of this package, by folder or file."""
     parts = {f"{name}.py": [_ROOT / f"{name}.py"] for name in _FILES}
     for path in sorted(path for name in _FOLDERS for path in (_ROOT / name).rglob("*.py")):
-        if path.name not in _READERS:
+        if path.name != _READER:
             parts.setdefault(path.parent.relative_to(_ROOT).as_posix(), []).append(path)
     return {part: source_digest({path.name: path for path in paths}) for part, paths in parts.items()}
 
