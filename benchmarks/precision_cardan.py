@@ -154,7 +154,7 @@ def _constant(solver: str, count: int) -> Callable[[Columns, float], Any]:
     def one(values: Mapping[str, Any], step: Any) -> Any:
         form = Cardan.of(values).floquet_model().natural
         steps = EqualStepSize(jnp.round(np.pi / step).astype(int))
-        return diffrax_propagator(form, getattr(diffrax, solver)(**settings), stepsize_controller=steps)[0].matrix
+        return diffrax_propagator(form, getattr(diffrax, solver)(**settings), stepsize_controller=steps)[0]
 
     kinds = {name: jax.ShapeDtypeStruct((count,), float) for name in NAMES}
     return jax.jit(jax.vmap(one, in_axes=(0, None))).lower(kinds, jax.ShapeDtypeStruct((), float)).compile()

@@ -163,6 +163,7 @@ FLOQUET = Declared(
         ),
         within("spectral_radius", 0.0),
     ),
+    gaps=("floquet_multiplier", "floquet_multiplier_error", "floquet_exponent"),
 )
 
 

@@ -27,8 +27,8 @@ def floquet(system: System, *, outputs: Sequence[str] | None = None, **options: 
     Args:
         system: a system with a model for it, such as ``Cardan`` or ``Tripod``; one point, or a batch under ``jax.vmap``.
         outputs: variables wanted; default ``spectral_radius``, ``spectral_radius_error`` (absolute bound), ``verdict`` (0
-            stable, 1 unstable, 2 undecided). Also ``floquet_multiplier`` (n,), ``floquet_exponent`` (n,) [1/s],
-            ``liouville_residual``.
+            stable, 1 unstable, 2 undecided). Also ``floquet_multiplier`` (n,) with ``floquet_multiplier_error``, and
+            ``floquet_exponent`` (n,) [1/s], NaN where below the error; ``liouville_residual``.
         options: ``method`` ("auto", "direct", "diffrax"), ``rtol``; see ``drivetrain list cardan``.
 
     Returns: a :class:`Result`. Differentiable: radius, multipliers and exponents; NaN where multipliers coalesce or tie.

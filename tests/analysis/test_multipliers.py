@@ -9,6 +9,7 @@ import pytest
 
 from drivetrain_jax.analysis.floquet.multipliers import (
     characteristic_coefficients,
+    multiplier_errors,
     root_scale,
     sort_multipliers,
     spectral_radius_bound,
@@ -118,6 +119,17 @@ def test_bound_is_never_violated(pairs, bound):
             np.abs(rho - reference)[violated][:5],
             limit[violated][:5],
         )
+
+
+def test_every_multiplier_lies_within_its_error(pairs):
+    """With either set of roots as the computed one, each has a root of the other set within its error."""
+    _, roots, other, _ = pairs
+    apart = np.abs(roots[:, :, None] - other[:, None])
+    exact, changed = exact_coefficients(roots), exact_coefficients(other)
+    for computed, distance in ((roots, apart.min(axis=2)), (other, apart.min(axis=1))):
+        error = difference(exact, changed, np.abs(computed).max(axis=1))
+        limit = np.asarray(jax.jit(multiplier_errors)(computed.real.T, computed.imag.T, error)).T
+        assert (distance <= limit).all(), (distance / limit).max()
 
 
 def test_bound_of_a_multiple_root_is_the_root_of_the_error(bound):

@@ -69,6 +69,46 @@ def test_an_ince_strutt_diagram_has_stable_regions(method):
     assert np.all(np.asarray(found.spectral_radius)[expected] == 1)
 
 
+# a, q and |trace|/2 - 1 at edges of bands, by Taylor series of 260 bits: within the period solutions grow up to 1e12 times.
+EDGES = np.array([
+    (-152.86096230651398, 132.25485445667033, 0.15308510132462463),
+    (-142.57791794097508, 155.25975069540155, 0.14268388633519455),
+    (-139.68974490361666, 78.58271971601185, 0.016110527522535802),
+    (-138.79833381742287, 152.62569995168226, -0.02925867528999017),
+    (-53.004980424483264, 155.57921414008686, 6.80451308263632e-05),
+    (-81.74027957148884, 47.645299649699666, 1.4833321709035173e-05),
+    (-26.969831798909805, 131.39276457983962, -8.82297088088834e-07),
+    (-21.30486062, 25.0, 510.861100303945820),
+    (1.0139188200111349, 5.0, 10.176599660527210),
+]).T  # fmt: skip
+
+
+@pytest.mark.parametrize("method", ["direct", pytest.param("diffrax", marks=pytest.mark.full)])
+def test_bounds_hold_where_solutions_grow_within_the_period(method):
+    a, q, above = EDGES
+    exact = np.where(above > 0, 1 + above + np.sqrt(np.maximum(above * (2 + above), 0)), 1.0)
+    for rtol in (1e-6, 1e-9, 1e-12):
+        found = jax.vmap(
+            lambda a, q: dt.floquet(Mathieu(a=a, q=q), outputs=OUTPUTS, method=method, rtol=rtol)  # noqa: B023
+        )(a, q)
+        error = np.abs(np.asarray(found.spectral_radius) - exact)
+        assert np.all(error <= found.spectral_radius_error), error / found.spectral_radius_error
+        assert not np.any((found.verdict == 0) & (exact > 1)) and not np.any((found.verdict == 1) & (exact == 1))
+    assert found.verdict[-2:].tolist() == [1, 1]
+
+
+def test_a_multiplier_below_its_error_is_not_known():
+    """x'' = 25 x + 0 cos 2t: the multipliers are exp(+-5 pi), and for 121 the smaller one is below the rounding."""
+    outputs = ["floquet_multiplier", "floquet_multiplier_error", "spectral_radius"]
+    found = jax.vmap(lambda a: dt.floquet(Mathieu(a=a, q=0.0), outputs=outputs))(np.array([-4.0, -25.0, -121.0]))
+    exact = np.exp(math.pi * np.array([[2.0, -2.0], [5.0, -5.0], [11.0, -11.0]]))
+    error = np.abs(np.asarray(found.floquet_multiplier) - exact)
+    assert np.array_equal(np.isnan(error), [[False, False], [False, True], [False, True]])
+    assert np.all((error <= found.floquet_multiplier_error) | np.isnan(error)) and found.outcome.tolist() == [0] * 3
+    assert np.all(error[:, 0] <= 1e-9 * exact[:, 0])
+    assert np.array_equal(np.isnan(found.floquet_multiplier_error), np.isnan(error))
+
+
 @pytest.mark.full
 def test_masses_without_damping():
     """Modes in and against phase: Mathieu's equation with a and with a + 0.6."""

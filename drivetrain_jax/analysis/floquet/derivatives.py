@@ -42,8 +42,8 @@ class DifferentiableMonodromy(NamedTuple):
 class Multipliers(NamedTuple):
     """Multipliers ``sigma`` by falling modulus, ``(n,)``, and their derivatives by the entries of the matrix, ``(n, n, n)``.
 
-    A derivative is NaN where its multiplier is not simple. ``error`` is the relative error of the first multiplier, which
-    grows where multipliers coalesce.
+    A derivative is NaN where its multiplier is not simple, or below its error. ``error`` is the relative error of the first
+    multiplier, which grows where multipliers coalesce.
     """
 
     sigma: Array
@@ -94,9 +94,10 @@ def multipliers(z: Array) -> Multipliers:
     adjugate = jnp.stack([sigma[:, None, None] ** (n - 1 - j) * term for j, term in enumerate(terms)]).sum(axis=0)
     slope = jnp.trace(adjugate, axis1=1, axis2=2)
     simple = jnp.abs(slope) > _SIMPLE * rho ** (n - 1)
-    by_entry = jnp.swapaxes(adjugate, 1, 2) / jnp.where(simple, slope, jnp.nan)[:, None, None]
-    condition = jnp.linalg.norm(adjugate[0]) * jnp.linalg.norm(z) / jnp.abs(slope[0])
-    return Multipliers(sigma, by_entry, _MATRIX_ERROR * condition / rho)
+    error = _MATRIX_ERROR * jnp.linalg.norm(adjugate, axis=(1, 2)) * jnp.linalg.norm(z) / jnp.abs(slope)
+    known = simple & (error < jnp.abs(sigma))
+    by_entry = jnp.swapaxes(adjugate, 1, 2) / jnp.where(known, slope, jnp.nan)[:, None, None]
+    return Multipliers(sigma, by_entry, error[0] / rho)
 
 
 def shares_modulus(sigma: Array, error: Array | float) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import reduce
+from functools import partial, reduce
 from typing import Any
 
 import diffrax
@@ -14,12 +14,12 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis._base import Outcome, Request, Solver
-from drivetrain_jax.analysis.floquet.direct import Monodromy, Propagator, compare, stiffness_of, unknown
-from drivetrain_jax.analysis.floquet.effort import stable_steps, steps_needed, traced_steps
-from drivetrain_jax.analysis.floquet.propagator import EqualStepSize, LinearTerm
+from drivetrain_jax.analysis.floquet.direct import Monodromy, Propagator, compare, unknown
+from drivetrain_jax.analysis.floquet.effort import stable_steps, steps_needed, traced_panels, traced_steps
+from drivetrain_jax.analysis.floquet.propagator import EqualStepSize, LinearTerm, march
 from drivetrain_jax.analysis.floquet.results import NEED_ERROR, results
 from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last, over_lanes
-from drivetrain_jax.systems import LinearPeriodic, System
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System
 
 # Most steps over the span; usual points take up to 1e4. With equal steps, points that are predicted to need more are not
 # begun, and no refinement has more.
@@ -31,6 +31,10 @@ _REDUCTION = 4.0
 # Ratio of rtol to the target of the matrix: the bound of a spectral radius is up to a hundred times the bound of its
 # matrix, and succeeds up to ten tolerances.
 _MARGIN = 40
+# Accuracy of the march that records how errors grow.
+_OF_RECORDS = 1e-6
+
+Build = Callable[[Mapping[str, Any]], FloquetModel]
 
 
 def diffrax_solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
@@ -53,14 +57,12 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
         shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in values.values() if not isinstance(x, str)))
         order = solver.order(model.reduced)
 
-        def propagate(steps: Array) -> Propagator:
-            def one(own: Mapping[str, Any], steps: Array) -> Propagator:
-                return equal_step_propagator(build(own).reduced, solver, steps)
+        def propagate(steps: Array) -> Array:
+            return over_lanes(lambda own, steps: _in_equal_steps(build(own).reduced, solver, steps))(values, steps)
 
-            return over_lanes(one)(values, steps)
-
+        records = over_lanes(partial(_records, build))(values, jnp.max(traced_panels(build, values, _OF_RECORDS)))
         steps = jnp.maximum(steps, jnp.ceil(stable_steps(model.reduced)).astype(steps.dtype))
-        z = _refined(model.reduced, propagate, jnp.minimum(steps, MAX_STEPS), shape, rtol / _MARGIN, order)
+        z = _refined(model.reduced, propagate, records, jnp.minimum(steps, MAX_STEPS), shape, rtol / _MARGIN, order)
         return results(z, request.outputs, rtol, model)
 
     def effort(columns: Mapping[str, Any]) -> np.ndarray:
@@ -77,9 +79,16 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
     return (Solver(f"diffrax: {request.options['solver']}, equal steps", solve, effort, steps, chunk=256, march=True),)
 
 
+def _records(build: Build, values: Mapping[str, Any], panels: Array, natural: bool = False) -> Propagator:
+    """How errors grow in one point, whatever method makes them: by the march of ``direct``."""
+    model = build(values)
+    return march(model.natural if natural else model.reduced, panels).in_units_of(jnp.zeros(()))
+
+
 def _refined(
     form: LinearPeriodic,
-    propagate: Callable[[Array], Propagator],
+    propagate: Callable[[Array], Array],
+    records: Propagator,
     steps: Array,
     shape: tuple[int, ...],
     target: float,
@@ -90,9 +99,8 @@ def _refined(
     A lane that overflows has two doublings to recover and then no longer delays the others.
     """
     ends, determinant = form.ends(), form.log_determinant and form.log_determinant()
-    stiffness = stiffness_of(form, shape)
     propagate = jax.jit(propagate)  # traced once, not for its shapes and again for its values
-    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(propagate, steps))
+    blank = records._replace(matrix=jnp.zeros_like(records.matrix))
     nothing = jax.tree.map(
         lambda x: jnp.broadcast_to(x.reshape(*x.shape, *(1,) * len(shape)), (*x.shape, *shape)), unknown(form.size)
     )
@@ -105,13 +113,13 @@ def _refined(
 
     def refine(state: tuple) -> tuple:
         count, current, coarse, _ = state
-        fine = propagate(current)._replace(stiffness=stiffness)
+        fine = records._replace(matrix=propagate(current))
         found = jax.lax.cond(
             count > 0, lambda: compare(ends, determinant, coarse, fine, current, 2.0**order, target), lambda: nothing
         )
         return count + 1, 2 * current, fine, found
 
-    start = (jnp.int32(0), jnp.maximum(-(-steps // 2), 1), blank._replace(stiffness=stiffness), nothing)
+    start = (jnp.int32(0), jnp.maximum(-(-steps // 2), 1), blank, nothing)
     return jax.lax.while_loop(unfinished, refine, start)[-1]
 
 
@@ -123,16 +131,20 @@ def adaptive_steps(system: type[System], request: Request) -> tuple[Solver, ...]
 
     def solve(values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
         del effort
-        model = system.models["floquet"].build(values)
+        build = system.models["floquet"].build
+        model = build(values)
         form = model.natural if as_published else model.reduced
 
-        def propagate(tolerance: float) -> tuple[Propagator, Array]:
+        def propagate(tolerance: float) -> tuple[Array, Array]:
             controller = diffrax.PIDController(rtol=tolerance, atol=tolerance / rtol * atol)
             return diffrax_propagator(form, solver, stepsize_controller=controller, max_steps=MAX_STEPS)
 
         fine, success = propagate(rtol / 10)
         coarse, success_coarse = propagate(rtol) if needs_error else (fine, success)
         determinant = form.log_determinant and form.log_determinant()
+        panels = traced_panels(build, values, _OF_RECORDS) * (2 if as_published else 1)
+        records = _records(build, values, panels, as_published) if needs_error else Propagator(fine, jnp.zeros(()))
+        coarse, fine = (records._replace(matrix=matrix) for matrix in (coarse, fine))
         z = compare(form.ends(), determinant, coarse, fine, jnp.zeros(()), 1 + _REDUCTION, rtol)
         found = results(z, request.outputs, rtol, model)
         failed = ~(success & success_coarse)
@@ -149,15 +161,12 @@ def adaptive_steps(system: type[System], request: Request) -> tuple[Solver, ...]
     return (Solver(name, over_lanes(solve), effort, chunk=256),)
 
 
-def equal_step_propagator(form: LinearPeriodic, solver: diffrax.AbstractSolver, steps: Array) -> Propagator:
+def _in_equal_steps(form: LinearPeriodic, solver: diffrax.AbstractSolver, steps: Array) -> Array:
     """The propagator of one point by ``steps`` equal steps.
 
     Under ``jax.vmap`` the lanes are the last axis of a single state, which halves the time of ``solver``.
     """
-    matrices = [_of_part(part, solver, steps) for part in form.parts]
-    matrix = reduce(lambda before, after: after @ before, matrices)
-    zero = jnp.zeros(())
-    return Propagator(matrix, zero, jnp.ones(()), zero, zero, zero, zero - jnp.inf)
+    return reduce(lambda before, after: after @ before, [_of_part(part, solver, steps) for part in form.parts])
 
 
 def _of_part(form: LinearPeriodic, solver: diffrax.AbstractSolver, steps: Array) -> Array:
@@ -199,7 +208,7 @@ def has_finite_entries(form: LinearPeriodic) -> Array:
 
 def diffrax_propagator(
     form: LinearPeriodic, solver: diffrax.AbstractSolver, max_steps: int | None = None, **options: Any
-) -> tuple[Propagator, Array]:
+) -> tuple[Array, Array]:
     """The propagator of one point over the span, NaN where the integration failed, and whether it succeeded."""
     matrix, success = jnp.eye(form.size), has_finite_entries(form)
     for part in form.parts:
@@ -219,4 +228,4 @@ def diffrax_propagator(
         )
         success &= solution.result == diffrax.RESULTS.successful
         matrix = solution.ys[-1]  # pyright: ignore[reportOptionalSubscript]
-    return Propagator(jnp.where(success, matrix, jnp.nan), jnp.zeros(())), success
+    return jnp.where(success, matrix, jnp.nan), success

@@ -18,13 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.floquet.multipliers import characteristic_coefficients, root_scale
+from drivetrain_jax.analysis.floquet.multipliers import characteristic_polynomial, root_scale
 from drivetrain_jax.analysis.numerics.kernels import stored
 from drivetrain_jax.analysis.numerics.linear_algebra import square_sum
-from drivetrain_jax.analysis.numerics.staged import staged
 
 if TYPE_CHECKING:
-    from drivetrain_jax.systems import LinearPeriodic
     from drivetrain_jax.systems._models import Rows
 
 # Rounding of the entries of A, in units of the last place. A search for the worst points showed that half is too little.
@@ -34,20 +32,26 @@ _ENTRIES = 16
 class Propagator(NamedTuple):
     """``Phi = exp(log_scale) matrix``, shape ``(n, n, ...)``.
 
-    ``growth`` is the factor by which earlier errors have grown at the end T, against errors made at T: the root mean square
-    of ``|Phi(T, t)| |Phi(t, 0)| / |Phi(T, 0)|`` (1 at t = T). ``stiffness`` is the largest rate times the span, ``decay``
-    is ``-log det Phi``, and ``squared`` its ratio to the decay that counts as strong, 0 for first-order equations.
+    ``growth`` is the size at the end T of errors that were made on the way, each as large as the propagator at its time: the
+    root mean square of ``|Phi(T, t)| |Phi(t, 0)|``, in units of ``exp(log_scale)``. It may exceed ``|Phi(T, 0)|`` by many
+    powers of ten. ``stiffness`` is the largest rate times the span, ``decay`` is ``-log det Phi``, and ``squared`` its ratio
+    to the decay that counts as strong, 0 for first-order equations.
     ``undamped`` is the logarithm of the size that the fastest decaying mode may keep, because the scheme damps it too
     little, and infinite where an oscillation is too fast for the steps.
     """
 
     matrix: Array
     log_scale: Array
-    growth: Any = 1.0
+    growth: Any = 0.0
     stiffness: Any = 0.0
     decay: Any = 0.0
     squared: Any = 0.0
     undamped: Any = -np.inf
+
+    def in_units_of(self, log_scale: Array) -> Propagator:
+        """The same with another ``log_scale``."""
+        factor = jnp.exp(self.log_scale - log_scale)
+        return self._replace(matrix=factor * self.matrix, log_scale=log_scale, growth=factor * self.growth)
 
 
 class Monodromy(NamedTuple):
@@ -123,30 +127,29 @@ def compare(
 ) -> Monodromy:
     """Monodromy matrix of ``fine`` and its error.
 
-    ``ends`` are those of the system, ``gain`` is the error of ``coarse`` over the error of ``fine``. The propagators are
-    compared too, because the errors of a product of nearly rank one may be small by accident, relative to its norm.
-    Rounding of the matrix products accumulates like the square root of ``steps``, and grows until the end of the march by
-    the factor ``fine.growth``, but at most to the difference from ``coarse``. Rounding of the entries of A is equal in both
-    propagators and shifts exponents by `_ENTRIES` units of the stiffness; the slow modes of strong damping are differences
-    of the squared entries of second-order equations, and their shift grows with the size of the products.
+    ``ends`` are those of the system, ``gain`` is the error of ``coarse``, in the same units, over the error of ``fine``. The
+    propagators are compared too, because the errors of a product of nearly rank one may be small by accident, relative to
+    its norm. Rounding accumulates like the square root of ``steps``, or like ``steps`` where they are equal, which shows in
+    the difference from ``coarse``; what was made on the way has at the end the size ``fine.growth``. Rounding of the entries
+    of A is equal in both propagators and shifts exponents by `_ENTRIES` units of the stiffness; the slow modes of strong
+    damping are differences of the squared entries of second-order equations, and their shift grows with the size of the
+    products.
     """
     halves, n = (1 if ends is None else 2), len(fine.matrix)
-    other = jnp.exp(coarse.log_scale - fine.log_scale) * coarse.matrix
-    z_fine, z_coarse = (stored(partial(assemble, ends))(phi) for phi in (fine.matrix, other))
-    size = jnp.abs(fine.matrix)
-    if ends is not None:
-        magnitudes = jax.tree.map(lambda x: abs(x) if isinstance(x, int | float) else jnp.abs(x), ends)
-        size = stored(partial(assemble, magnitudes))(size)
-        scales = stored(_balance)(size)
-        z_fine, z_coarse, size = (stored(_scaled)(matrix, scales) for matrix in (z_fine, z_coarse, size))
+    z_fine, z_coarse = (stored(partial(assemble, ends))(phi) for phi in (fine.matrix, coarse.matrix))
+    magnitudes = jax.tree.map(lambda x: abs(x) if isinstance(x, int | float) else jnp.abs(x), ends)
+    size = stored(partial(assemble, magnitudes))(jnp.abs(fine.matrix))
+    scales = stored(_balance)(size)
+    z_fine, z_coarse, size = (stored(_scaled)(matrix, scales) for matrix in (z_fine, z_coarse, size))
     norm = jnp.sqrt(square_sum(size))
-    a_fine, a_coarse = (stored(characteristic_coefficients)(z) for z in (z_fine, z_coarse))
+    (a_fine, slopes), (a_coarse, _) = (stored(characteristic_polynomial)(z) for z in (z_fine, z_coarse))
     scale = stored(root_scale)(a_fine)
     log_scale = halves * fine.log_scale
     apart = z_fine - z_coarse
     differences = [jnp.sqrt(square_sum(apart)) / scale]
     differences += [jnp.abs(a_fine[k] - a_coarse[k]) / scale ** (k + 1) for k in range(n)]
-    differences.append(jnp.sqrt(square_sum(fine.matrix - other) / square_sum(fine.matrix)))
+    square = square_sum(fine.matrix)
+    differences.append(jnp.sqrt(square_sum(fine.matrix - coarse.matrix) / square))
     difference = 4 * reduce(jnp.maximum, differences)
     truncation = difference / (gain - 1)
     residual = jnp.zeros_like(scale)
@@ -156,27 +159,11 @@ def compare(
     left = jnp.exp(halves * (fine.undamped - fine.log_scale)) / scale
     truncation = reduce(jnp.maximum, (truncation, jnp.abs(residual), left))
     unit = np.finfo(float).eps * norm / scale
-    at_the_end = (4 + jnp.sqrt(steps)) * unit
-    grown = jnp.minimum(jnp.maximum(fine.growth - 1, 0.0) * at_the_end, difference)
+    # An error of Z as large as a rounding of its terms changes the coefficients by their slopes.
+    slope = reduce(jnp.maximum, (slopes[k] / scale**k for k in range(1, n)), 1.0)
+    grown = slope * jnp.sqrt(jnp.maximum(fine.growth**2 / square, 1.0)) * unit
+    of_products = (1 + jnp.sqrt(steps) / 2) * grown + jnp.minimum(steps / 2 * grown, difference)
     of_entries = _ENTRIES * fine.stiffness * (halves * np.finfo(float).eps + jnp.minimum(fine.squared, 1.0) * unit)
-    rounding = at_the_end + grown + of_entries
+    rounding = of_products + of_entries
     met = truncation <= jnp.maximum(rtol, rounding)
     return Monodromy(z_fine, log_scale, truncation + rounding, met, residual, (4 / (gain - 1)) * apart)
-
-
-def stiffness_of(system: LinearPeriodic, shape: tuple[int, ...] = ()) -> Array:
-    """Largest rate times the span in every lane, for the batch shape ``shape``.
-
-    The rate is max |a_ij a_ji|^(1/2), which no scaling of states changes, averaged over 16 instants.
-    """
-    entries = _entries(system, (jnp.arange(16) + 0.5)[:, None] * system.span / 16)
-    pairs = [jnp.abs(entry * entries[j, i]) for (i, j), entry in entries.items() if j <= i and (j, i) in entries]
-    rate = reduce(jnp.maximum, pairs, jnp.zeros((16, *(shape or (1,)))))
-    return system.span * jnp.mean(jnp.sqrt(rate), axis=0).reshape(shape)
-
-
-def _entries(system: LinearPeriodic, times: Array) -> dict[tuple[int, int], Array]:
-    """The entries of A at ``times`` ``(K, 1)`` that do not vanish identically; what does not depend on time, once."""
-    basis = system.basis(times)
-    split = staged(system.entries, *basis)
-    return split.moving(split.fixed, *basis)

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.numerics.linear_algebra import matmul
+from drivetrain_jax.analysis.numerics.linear_algebra import matmul, square_sum
 
 VERDICTS = ("stable", "unstable", "undecided")
 
@@ -37,19 +37,27 @@ VERDICTS = ("stable", "unstable", "undecided")
 _LADDER = 0.99 * 10.0 ** (np.arange(-64, 5) / 4)
 
 
-def characteristic_coefficients(z: Array) -> Array:
-    """Coefficients a_1..a_n of det(s I - Z) = s^n + a_1 s^(n-1) + ..., ``(n, n, ...) -> (n, ...)``.
+def characteristic_polynomial(z: Array) -> tuple[Array, Array]:
+    """Coefficients a_1..a_n of det(s I - Z) = s^n + a_1 s^(n-1) + ... and the sizes of their slopes, each ``(n, ...)``.
 
-    By the recursion of Faddeev and Le Verrier.
+    By the recursion of Faddeev and Le Verrier, N_k = Z N_(k-1) + a_k I, where ``-N_(k-1)^T`` is the derivative of a_k by the
+    entries of Z. Its size is ``|N_(k-1)|/sqrt(n)``, 1 for the trace.
     """
     n = z.shape[0]
-    power, coefficients = z, []
+    unit = np.eye(n).reshape(n, n, *(1,) * (z.ndim - 2))
+    power, coefficients, slopes = z, [], [jnp.ones(z.shape[2:])]
     for k in range(1, n + 1):
         a = -sum(power[i, i] for i in range(n)) / k
         coefficients.append(a)
         if k < n:
+            slopes.append(jnp.sqrt(square_sum(power + a * unit) / n))
             power = matmul(z, power) + a * z
-    return jnp.stack(coefficients)
+    return jnp.stack(coefficients), jnp.stack(slopes)
+
+
+def characteristic_coefficients(z: Array) -> Array:
+    """Coefficients a_1..a_n of det(s I - Z) = s^n + a_1 s^(n-1) + ..., ``(n, n, ...) -> (n, ...)``."""
+    return characteristic_polynomial(z)[0]
 
 
 def root_scale(coefficients: Array) -> Array:
@@ -142,6 +150,19 @@ def _circle_around(distances: Array, eps: Callable[[Array], Array]) -> Array:
     return jax.lax.fori_loop(0, ladder.size, descend, jnp.full(distances.shape[1:], jnp.inf))
 
 
+def multiplier_errors(real: Array, imaginary: Array, error: Array) -> Array:
+    """Bound of the error of each multiplier ``real + i imaginary``, ``(n, ...) -> (n, ...)``; inf if nothing is known.
+
+    ``error`` as in :func:`spectral_radius_bound`.
+    """
+    n = len(real)
+    rho = jnp.max(jnp.hypot(real, imaginary), axis=0)
+    distances = jnp.hypot(real[:, None] - real, imaginary[:, None] - imaginary) / rho
+    # All circles of use lie within |z| <= 1 + r, as those of the spectral radius.
+    radius = _circle_around(distances, lambda r: n * error * (1 + r) ** (n - 1))
+    return rho * (radius + 4 * np.finfo(float).eps)
+
+
 def all_on_the_circle(real: Array, imaginary: Array, error: Array, scale: Array) -> Array:
     """True if all multipliers ``scale (real + i imaginary)`` without damping are simple and on the unit circle, ``(...)``.
 
@@ -149,17 +170,12 @@ def all_on_the_circle(real: Array, imaginary: Array, error: Array, scale: Array)
     """
     n = len(real)
     modulus = jnp.hypot(real, imaginary)
-    rho = jnp.max(modulus, axis=0)
-    gaps = jnp.hypot(real[:, None] - real, imaginary[:, None] - imaginary) / rho
-
-    def eps(r: Array) -> Array:
-        return n * error * (1 + r) ** (n - 1)
-
-    radius = _circle_around(gaps, eps)
-    gaps = jnp.where(jnp.eye(n, dtype=bool).reshape(n, n, *(1,) * rho.ndim), jnp.inf, gaps)
+    radius = multiplier_errors(real, imaginary, error)
+    gaps = jnp.hypot(real[:, None] - real, imaginary[:, None] - imaginary)
+    gaps = jnp.where(jnp.eye(n, dtype=bool).reshape(n, n, *(1,) * (real.ndim - 1)), jnp.inf, gaps)
     # Four radii about a multiplier at the unit circle contain the reflection of its circle if that is below 0.1.
-    apart = (radius < 0.1) & jnp.all(gaps > 4 * radius[:, None] + radius, axis=1)
-    return jnp.all(apart & (jnp.abs(scale * modulus - 1) <= radius * scale * rho), axis=0)
+    apart = (scale * radius < 0.1) & jnp.all(gaps > 4 * radius[:, None] + radius, axis=1)
+    return jnp.all(apart & (jnp.abs(scale * modulus - 1) <= scale * radius), axis=0)
 
 
 def verdict(rho: Array, error: Array) -> Array:

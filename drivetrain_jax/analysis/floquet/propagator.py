@@ -24,7 +24,7 @@ from drivetrain_jax.analysis.floquet.direct import Monodromy, Propagator, compar
 from drivetrain_jax.analysis.numerics.collocation import Scheme, first_order, gauss, panel, second_order
 from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, on_cpu, stored, suits_one_kernel
 from drivetrain_jax.analysis.numerics.lanes import Constants, blocks_first, blocks_joined, lanes_last, traced_once
-from drivetrain_jax.analysis.numerics.linear_algebra import largest, matmul, square_sum
+from drivetrain_jax.analysis.numerics.linear_algebra import largest, matmul
 from drivetrain_jax.analysis.numerics.staged import staged
 from drivetrain_jax.systems import LinearPeriodic
 
@@ -201,8 +201,8 @@ def _agreeing(
         state = _State.start(n, lanes)
         for march, own in zip(marches, fixed, strict=True):
             state = march.through(own, state, count, records)
-        found = state.propagator(count)
-        return found if marches[0].d == n else found._replace(squared=found.decay / _STRONG)
+        found = state.propagator(len(marches) * count)
+        return found if marches[0].d == n else found._replace(squared=jnp.maximum(found.decay, 0.0) / _STRONG)
 
     def unfinished(state: tuple) -> Array:
         number, count, propagator, found = state
@@ -211,16 +211,17 @@ def _agreeing(
 
     def refine(state: tuple) -> tuple:
         number, count, coarse, _ = state
-        fine = run(count, number == 0)
-        fine = Propagator(
-            *fine[:2], *(jnp.where(number == 0, *pair) for pair in zip(fine[2:], coarse[2:], strict=True))
-        )
+        recorded = number != 1
+        fine = run(count, recorded)
+        coarse = coarse.in_units_of(fine.log_scale)
+        fine = Propagator(*fine[:2], *(jnp.where(recorded, *pair) for pair in zip(fine[2:], coarse[2:], strict=True)))
         missed = (fine.stiffness > _RESOLVED * count) & (fine.decay < fine.stiffness)
         undamped = jnp.where(fine.decay > 0, -_UNDAMPED * (1.0 * count) ** 2 / fine.decay, -jnp.inf)
         fine = fine._replace(undamped=jnp.where(missed, jnp.inf, undamped))
-        gain = jnp.where(number == 1, count / first, 2.0) ** ORDER
+        # Half as many panels may not show the order yet, unless the system predicts how many it needs.
+        gain = jnp.where(number == 1, count / first, 2.0) ** jnp.where(ratio > 2, ORDER, ORDER - 3)
         found = jax.lax.cond(
-            number > 0, lambda: compare(ends, determinant, coarse, fine, count, gain, rtol), lambda: none
+            number > 0, lambda: compare(ends, determinant, coarse, fine, len(marches) * count, gain, rtol), lambda: none
         )
         return number + 1, jnp.where(number == 0, panels, 2 * count), fine, found
 
@@ -243,9 +244,10 @@ def _any(flags: Array) -> Array:
 class _State(NamedTuple):
     """``exp(log_scale) matrix`` at a time t, with two records of the march so far.
 
-    ``covariance`` is that of errors at t which were made at the ends of all panels: independent, each as large as the matrix
-    at its time. With the propagator P of a panel it obeys ``C' = P C P^T + |matrix|^2 I``. ``stiffness`` is the integral of
-    the largest rate max |a_ij a_ji|^(1/2), which no scaling of states changes, and ``decay`` that of ``-tr A``.
+    ``covariance`` is that of errors at t which were made at the ends of all panels: independent, and in each row as large as
+    the terms of its products. With the propagator P of a panel it obeys ``C' = P C P^T + D``, where D is the diagonal of
+    ``(|P| |matrix|) (|P| |matrix|)^T``. ``stiffness`` is the integral of the largest rate max |a_ij a_ji|^(1/2), which no
+    scaling of states changes, and ``decay`` that of ``-tr A``.
     """
 
     matrix: Array
@@ -270,7 +272,7 @@ class _State(NamedTuple):
 
     def propagator(self, panels: Any) -> Propagator:
         n = len(self.matrix)
-        variance = sum(self.covariance[i, i] for i in range(n)) / (n * panels * square_sum(self.matrix))
+        variance = sum(self.covariance[i, i] for i in range(n)) / (n * panels)
         return Propagator(
             self.matrix,
             self.log_scale,
@@ -347,11 +349,11 @@ class Panels:
         matrix = stored(matmul)(moved, state.matrix)
         factor = stored(_factor)(matrix)
         matrix = stored(jnp.multiply)(matrix, factor)
-        size = stored(square_sum)(matrix)
 
         def recorded() -> tuple[Array, ...]:
             carried = stored(matmul)(moved, state.covariance)
-            covariance = stored(_covariance)(carried, moved, factor, size)
+            terms = stored(matmul)(jnp.abs(moved), jnp.abs(state.matrix))
+            covariance = stored(_covariance)(carried, moved, factor, terms)
             stiffness, decay = stored(self._rates)(coefficients)
             return covariance, state.stiffness + stiffness, state.decay + decay
 
@@ -373,9 +375,9 @@ class Panels:
         return integrals[0], integrals[1]
 
 
-def _covariance(carried: Array, moved: Array, factor: Array, size: Array) -> Array:
-    unit = np.eye(len(moved))[..., None]
-    return matmul(carried, jnp.swapaxes(moved, 0, 1)) * factor**2 + size * unit
+def _covariance(carried: Array, moved: Array, factor: Array, terms: Array) -> Array:
+    squares = jnp.asarray(sum(terms[:, j] ** 2 for j in range(len(terms))))
+    return (matmul(carried, jnp.swapaxes(moved, 0, 1)) + squares[:, None] * np.eye(len(terms))[..., None]) * factor**2
 
 
 def _factor(matrix: Array) -> Array:

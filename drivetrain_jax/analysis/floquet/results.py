@@ -13,7 +13,13 @@ from jax import Array
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis._base import Outcome, finite_results
 from drivetrain_jax.analysis.floquet.direct import Monodromy
-from drivetrain_jax.analysis.floquet.multipliers import VERDICTS, all_on_the_circle, sort_multipliers, verdict
+from drivetrain_jax.analysis.floquet.multipliers import (
+    VERDICTS,
+    all_on_the_circle,
+    multiplier_errors,
+    sort_multipliers,
+    verdict,
+)
 from drivetrain_jax.analysis.floquet.radius import (
     Spectrum,
     has_closed_form,
@@ -28,17 +34,18 @@ if TYPE_CHECKING:
 
 VARIABLES = (
     Variable("floquet_multiplier", "1", "Floquet multiplier over one period", ("multiplier",), "complex128"),
+    Variable("floquet_multiplier_error", "1", "bound of the absolute error of floquet_multiplier", ("multiplier",)),
     Variable("floquet_exponent", "1/s", "real part of the Floquet exponent", ("multiplier",)),
     Variable("spectral_radius", "1", "largest modulus of the Floquet multipliers"),
     Variable("spectral_radius_error", "1", "bound of the absolute error of spectral_radius"),
     Variable("verdict", "1", "stability of the equilibrium", dtype="int8", flags=VERDICTS),
     Variable("liouville_residual", "1", "(determinant of the monodromy matrix - exact value) / spectral_radius^n"),
 )
-NEED_ERROR = {"spectral_radius_error", "verdict"}
+MULTIPLIERS = {"floquet_multiplier", "floquet_multiplier_error", "floquet_exponent"}
+NEED_ERROR = {"spectral_radius_error", "verdict", *MULTIPLIERS}
 _TINY = np.finfo(float).tiny
 # Relative error of a spectral radius that is known to be 1.
 _ROUNDING = 4 * np.finfo(float).eps
-MULTIPLIERS = {"floquet_multiplier", "floquet_exponent"}
 
 
 def lacks(system: type[System]) -> dict[str, str]:
@@ -48,25 +55,31 @@ def lacks(system: type[System]) -> dict[str, str]:
     return {"floquet_exponent": f"a rate in 1/s, and the time of {system.name} has no unit"}
 
 
-def _with_product(multipliers: Array, logarithms: Array, log_product: Array) -> tuple[Array, Array]:
-    """Two multipliers and the logarithms of their moduli, the smaller multiplier from the product of both.
-
-    The product is used where the moduli differ by more than a factor of two: as an eigenvalue the smaller multiplier has the
-    absolute error of the larger one, and with strong damping this error exceeds its value.
-    """
-    apart = logarithms[0] - logarithms[1] > math.log(2)
-    second = jnp.where(apart, jnp.exp(log_product) / multipliers[0], multipliers[1])
-    other = jnp.where(apart, log_product - logarithms[0], logarithms[1])
-    return jnp.stack([multipliers[0], second]), jnp.stack([logarithms[0], other])
-
-
 def _of_multipliers(z: Monodromy, finite: Array, spectrum: Spectrum, system: LinearPeriodic) -> dict[str, Array]:
+    """Multipliers with their errors and exponents; NaN where the error exceeds the multiplier.
+
+    As eigenvalues small multipliers have the absolute errors of large ones. The smaller one of two follows from their
+    product, if that is known, where the moduli differ by more than a factor of two.
+    """
     multipliers = jnp.where(finite, sort_multipliers(*spectrum), jnp.nan)
+    errors = multiplier_errors(multipliers.real, multipliers.imag, z.error)
     logarithms = jnp.log(jnp.abs(multipliers))
     if len(multipliers) == 2 and system.log_determinant is not None:
-        multipliers, logarithms = _with_product(multipliers, logarithms, system.log_determinant() - 2 * z.log_scale)
-    exponents = (logarithms + z.log_scale) / system.span
-    return {"floquet_multiplier": multipliers * jnp.exp(z.log_scale), "floquet_exponent": exponents}
+        log_product = system.log_determinant() - 2 * z.log_scale
+        apart = (jnp.arange(2) == 1).reshape(2, *(1,) * (multipliers.ndim - 1)) & (
+            logarithms[0] - logarithms[1] > math.log(2)
+        )
+        other = jnp.exp(log_product) / multipliers[0]
+        errors = jnp.where(apart, errors[0] / jnp.abs(multipliers[0]) * jnp.abs(other), errors)
+        multipliers = jnp.where(apart, other, multipliers)
+        logarithms = jnp.where(apart, log_product - logarithms[0], logarithms)
+    size, known = jnp.exp(z.log_scale), errors < jnp.abs(multipliers)
+    found = {
+        "floquet_multiplier": multipliers * size,
+        "floquet_multiplier_error": errors * size,
+        "floquet_exponent": (logarithms + z.log_scale) / system.span,
+    }
+    return {name: jnp.where(known, x, jnp.nan) for name, x in found.items()}
 
 
 def results(
@@ -121,4 +134,4 @@ def results(
     outcome = jnp.where(finite, outcome, Outcome.NOT_FINITE)
     found = {name: found[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}
     # An unknown error has an infinite bound, but multipliers beyond the largest number have no value.
-    return finite_results(found, infinite=("spectral_radius_error",))
+    return finite_results(found, gaps=MULTIPLIERS, infinite=("spectral_radius_error",))
