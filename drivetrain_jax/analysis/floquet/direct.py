@@ -18,7 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.floquet.multipliers import characteristic_polynomial, root_scale
+from drivetrain_jax.analysis.floquet.multipliers import (
+    characteristic_coefficients,
+    characteristic_polynomial,
+    root_scale,
+)
 from drivetrain_jax.analysis.numerics.kernels import stored
 from drivetrain_jax.analysis.numerics.linear_algebra import square_sum
 
@@ -142,7 +146,8 @@ def compare(
     scales = stored(_balance)(size)
     z_fine, z_coarse, size = (stored(_scaled)(matrix, scales) for matrix in (z_fine, z_coarse, size))
     norm = jnp.sqrt(square_sum(size))
-    (a_fine, slopes), (a_coarse, _) = (stored(characteristic_polynomial)(z) for z in (z_fine, z_coarse))
+    a_fine, slopes = stored(characteristic_polynomial)(z_fine)
+    a_coarse = stored(characteristic_coefficients)(z_coarse)
     scale = stored(root_scale)(a_fine)
     log_scale = halves * fine.log_scale
     apart = z_fine - z_coarse
