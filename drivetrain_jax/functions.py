@@ -183,24 +183,38 @@ def _compiled(job: _Job, index: int) -> Callable[..., dict[str, Array]]:
 def _pure(job: _Job) -> Callable[[Any], dict[str, Array]]:
     """The function of the parameters, with its derivatives."""
     _compile_cache.enable()
+    whole = jax.jit(partial(_solve, job, 0))
 
     @jax.custom_jvp
     def solve(parameters: Any) -> dict[str, Array]:
-        return _solve(job, 0, parameters, None)
+        return whole(parameters)
 
     @solve.defjvp
     def _(primals: tuple[Any], tangents: tuple[Any]) -> tuple[dict[str, Array], dict[str, Any]]:
         (parameters,), (directions,) = primals, tangents
-        analysis, direction = job.analysis, jnp.stack(jax.tree.leaves(directions))
-        outputs = tuple(dict.fromkeys((*job.request.outputs, *analysis.derivative_outputs(job.request.outputs))))
+        outputs = tuple(dict.fromkeys((*job.request.outputs, *job.analysis.derivative_outputs(job.request.outputs))))
         wider = job if outputs == job.request.outputs else replace(job, request=replace(job.request, outputs=outputs))
-        results = _pure(wider)(parameters)
-        known = analysis.derivatives
-        found = known(job.system, wider.request, parameters, job.constants, results) if known else {}
+        # A gradient outside of `jax.jit` and `jax.vmap`.
+        single = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(parameters))
+        results, jacobians = _with_jacobians(wider, single)(parameters)
+        direction = jnp.stack(jax.tree.leaves(directions))
         kept = {name: results[name] for name in (*job.request.outputs, OUTCOME.name)}
-        return kept, {name: _tangent(name, x, found, direction) for name, x in kept.items()}
+        return kept, {name: _tangent(name, x, jacobians, direction) for name, x in kept.items()}
 
-    return jax.jit(solve)
+    return solve
+
+
+@lru_cache(maxsize=64)
+def _with_jacobians(job: _Job, single: bool) -> Callable[[Any], tuple[dict[str, Array], Mapping[str, Array]]]:
+    """The results and their known Jacobians as a function of the parameters, compiled lightly for a ``single`` point."""
+
+    def both(parameters: Any) -> tuple[dict[str, Array], Mapping[str, Array]]:
+        results, known = _pure(job)(parameters), job.analysis.derivatives
+        found = known(job.system, job.request, parameters, job.constants, results) if known else {}
+        return results, found
+
+    light = single and not any(solver.lengthy for solver in job.solvers)
+    return jax.jit(both, compiler_options=options_for_few() if light else None)
 
 
 def _tangent(name: str, result: Array, jacobians: Mapping[str, Array], direction: Array) -> Any:
@@ -234,7 +248,7 @@ def _product(jacobian: Array, direction: Array) -> Array:
     return solution[:count]
 
 
-def _solve(job: _Job, index: int, parameters: Any, effort: Array | None) -> dict[str, Array]:
+def _solve(job: _Job, index: int, parameters: Any, effort: Array | None = None) -> dict[str, Array]:
     """The results of one point by solver number ``index``; without ``effort`` the effort is predicted for every lane."""
     solver = job.solvers[index]
 
