@@ -21,8 +21,8 @@ test: $(VENV)/installed-test lint  ## all tests in their short form
 validate: $(VENV)/installed-test  ## the comparisons at full size
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m full
 
-faults: $(VENV)/installed-test  ## real faults at random moments; writes the table of docs/reliability.md
-	$(BIN)/python tests/faults/suite.py
+faults: $(VENV)/installed-test  ## faults at every system call; writes the table of docs/reliability.md
+	$(BIN)/python tests/faults/crashes.py
 	$(BIN)/python -m pytest -m full tests/runs/test_resume_machine.py
 
 versions: $(VENV)/installed  ## the lowest and the newest versions of all dependencies, on every Python; writes the table of docs/reliability.md

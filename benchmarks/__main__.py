@@ -61,7 +61,6 @@ STUDIES = (
     Study("atlas", "cardan", "heyoka", full=("--repeats", "1"), quick=False),
     Study("peers", "cardan", "heyoka", quick=False),
     Study("batches", "cardan", quick=False),
-    Study("scaling", "cardan", full=("--repeats", "1"), quick=False),
     Study("waiting", "cardan", quick=False),
     Study("precision_bicardan", "bicardan"),
     Study("critical_speeds", "bicardan", peer_option="--ross", quick=False),

@@ -47,8 +47,9 @@ from drivetrain_jax.runs.scene import load_scene
 imported = time.perf_counter()
 _compile_cache.enable(short=True)
 engine = resolve(load_scene(scene))
-for group in engine.plan.groups:
-    kernel_of(engine.scene, engine.grid, group.solver, group.chunk)
+chunks = [chunk for block in engine.blocks() for chunk in engine.plan(block)]
+for index, size in {(chunk.solver, chunk.size) for chunk in chunks}:
+    kernel_of(engine.scene, engine.grid, engine.solvers[index], size)
 compiled = time.perf_counter()
 ran = warm = compiled
 if runs == 1:
@@ -86,8 +87,9 @@ def kernel_job(scene: Mapping[str, Any], width: int | None = None) -> tuple[Any,
     from drivetrain_jax.runs.scene import load_scene
 
     engine = resolve(load_scene(dict(scene)))
-    costs = engine.plan.costs
-    chunk = engine.plan.chunk(int(np.argmin(np.abs(costs - costs.mean()))))
+    chunks = [chunk for block in engine.blocks() for chunk in engine.plan(block)]
+    costs = np.array([chunk.cost for chunk in chunks])
+    chunk = chunks[int(np.argmin(np.abs(costs - costs.mean())))]
     size = width or chunk.size
     kernel = kernel_of(engine.scene, engine.grid, engine.solvers[chunk.solver], size)
     columns = engine.grid.columns(np.resize(chunk.points, size))

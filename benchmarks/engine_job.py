@@ -29,27 +29,29 @@ def engine_job(scene: Mapping[str, Any], threads: int = 1, spent: np.ndarray | N
     This call compiles the kernels, unless another scene of the process shares them. ``spent`` takes the seconds of each
     point: those of its chunk, divided evenly.
     """
-    from drivetrain_jax.runs.executor import run_threads
+    from drivetrain_jax.runs.executors import run_threads
     from drivetrain_jax.runs.kernel import kernel_of
     from drivetrain_jax.runs.resolve import resolve
     from drivetrain_jax.runs.scene import load_scene
 
     engine = resolve(load_scene(dict(scene)))
-    grid, plan = engine.grid, engine.plan
+    grid = engine.grid
+    chunks = [chunk for block in engine.blocks() for chunk in engine.plan(block)]
+    kinds = sorted({(chunk.solver, chunk.size) for chunk in chunks})
     shape = {key: sorted(value) if key == "points" else value for key, value in scene.items()}
-    with _COMPILING[repr((shape, [(group.solver.name, group.chunk) for group in plan.groups]))]:
-        kernels = {group.index: kernel_of(engine.scene, grid, group.solver, group.chunk) for group in plan.groups}
+    with _COMPILING[repr((shape, [(engine.solvers[index].name, size) for index, size in kinds]))]:
+        kernels = {kind: kernel_of(engine.scene, grid, engine.solvers[kind[0]], kind[1]) for kind in kinds}
 
     def work(chunk: Any) -> Mapping[str, np.ndarray]:
         columns, begin = grid.columns(chunk.points), time.perf_counter()
-        values = kernels[chunk.solver](columns, grid.numbers, chunk.effort)
+        values = kernels[chunk.solver, chunk.size](columns, grid.numbers, chunk.effort)
         if spent is not None:
             spent[chunk.points] = (time.perf_counter() - begin) / chunk.points.size
         return values
 
     def job() -> Results:
         found: Results = {}
-        for chunk, values in run_threads(engine.ordered(range(len(plan.costs))), work, threads):
+        for chunk, values in run_threads(chunks, work, threads):
             for name, array in values.items():
                 if name not in found:
                     found[name] = np.full((grid.size, *array.shape[1:]), np.nan if array.dtype.kind in "fc" else 0)

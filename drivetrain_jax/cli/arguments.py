@@ -128,7 +128,10 @@ def _add_run(subparsers: Any) -> None:
     )
     command.add_argument("--threads", type=int, metavar="N", help="number of threads (default: usable cores)")
     command.add_argument(
-        "--workers", type=int, metavar="N", help="N worker processes instead of threads; a worker may crash"
+        "--workers",
+        type=int,
+        metavar="N",
+        help="N Dask workers instead of threads, as --dask local:N; a worker may crash",
     )
     command.add_argument(
         "--dask", metavar="ADDRESS", help="Dask cluster instead of threads: tcp://HOST:PORT or local:N"

@@ -37,7 +37,7 @@ def _answer(reply: Any, options: argparse.Namespace) -> int:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Compute or resume a scene. Ctrl-C and SIGTERM stop it after finished chunks are written."""
+    """Compute or resume a scene. Ctrl-C and SIGTERM stop it; finished blocks are kept."""
     with stop_on_signals() as check:
         try:
             progress, code, reason = _compute(options, check)
@@ -48,9 +48,8 @@ def run(options: argparse.Namespace) -> int:
         if reason:
             sys.stderr.write(one_line(reason))
         sys.stderr.write(f"{progress}\n")
-        if code == INTERRUPTED and options.workers is None:
+        if code == INTERRUPTED:
             # A normal exit would wait for running chunks, whose results are not needed.
-            # Worker processes are already killed; a normal exit releases the resources shared with them.
             sys.stderr.flush()
             os._exit(code)
     return code
@@ -210,17 +209,13 @@ def explore(options: argparse.Namespace) -> int:
 
 
 def _reading(*files: Path) -> ExitStack:
-    """A context in which errors of readers are errors of these files; on a terminal it shows that the command works."""
-    from drivetrain_jax.store import gate
-
+    """A context that shows on a terminal that the command works on these files."""
     stack = ExitStack()
     if sys.stderr.isatty():
         from drivetrain_jax.cli.progress import working_on
 
         first, *more = [file.name for file in files]
         stack.enter_context(working_on(f"{first} and {len(more)} more" if more else first))
-    for file in files:
-        stack.enter_context(gate.reading(file))
     return stack
 
 

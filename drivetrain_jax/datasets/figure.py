@@ -122,16 +122,16 @@ def _dataset(source: Any) -> xr.Dataset:
 
 def _opened(path: Path) -> xr.Dataset:
     from drivetrain_jax.store.checksums import refuse_damaged
-    from drivetrain_jax.store.chunks import PartsFolder
     from drivetrain_jax.store.consolidate import open_result
+    from drivetrain_jax.store.parts import PartsFolder
 
     if path.exists() or not PartsFolder(path).holds_work():
         refuse_damaged(path)
         return open_result(path)
     # Local import: the module imports jax, which a complete result does not need.
-    from drivetrain_jax.runs import partial
+    from drivetrain_jax.runs import status
 
-    return partial.open_result(path)
+    return status.open_result(path)
 
 
 def _chart(

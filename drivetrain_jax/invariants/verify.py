@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.invariants import Finding, check
-from drivetrain_jax.store import checksums, gate, zarr_store
-from drivetrain_jax.store.chunks import PartsFolder
+from drivetrain_jax.store import checksums, zarr_store
 from drivetrain_jax.store.consolidate import open_result, read_attribute
+from drivetrain_jax.store.parts import PartsFolder
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -41,7 +43,7 @@ class Report:
 
 
 def verify(path: Path) -> Report:
-    """The report on the result at ``path``, or on the parts of an unfinished one.
+    """The report on the result at ``path``, or on the blocks of an unfinished one.
 
     Raises :class:`InputError` if there is neither, or if the file cannot be read.
     """
@@ -53,8 +55,7 @@ def verify(path: Path) -> Report:
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "not a regular file" if path.exists() else "does not exist"
         raise InputError(f"file = {str(path)!r}: {what}; give a result written by `drivetrain run`")
-    with gate.reading(path):
-        return _verify_file(path)
+    return _verify_file(path)
 
 
 def _verify_file(path: Path) -> Report:
@@ -101,9 +102,15 @@ def _verify_store(path: Path) -> Report:
 
 
 def _verify_parts(parts: PartsFolder) -> Report:
-    """The report on parts; damaged ones are no error, because a resumed run computes their chunks again."""
-    present, intact = parts.count(), sum(1 for _ in parts.read())
-    lines = [f"unfinished: {intact} of {present} parts are intact"]
-    if intact < present:
-        lines.append("the run that resumes computes the chunks of the others again")
+    """The report on stored blocks; damaged ones are no error, because a resumed run computes them again."""
+    store = parts.path / zarr_store.UNFINISHED
+    if store.is_dir():
+        present, shards = np.flatnonzero(zarr_store.done(store)).tolist(), zarr_store.shards_of(store)
+        intact = sum(zarr_store.read(store, shards, number) is not None for number in present)
+    else:
+        present = parts.blocks.numbers()
+        intact = sum(parts.blocks.read(number) is not None for number in present)
+    lines = [f"unfinished: {intact} of {len(present)} blocks are intact"]
+    if intact < len(present):
+        lines.append("the run that resumes computes the others again")
     return Report(tuple(lines), complete=False)

@@ -5,17 +5,18 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import drivetrain_jax
 from drivetrain_jax._machine import machine
-from drivetrain_jax._quantities import FIRST_FAILURE, Variable
+from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.identity import PACKAGES
 from drivetrain_jax.runs.point_grid import Grid
-from drivetrain_jax.runs.scene import Scene, result_variables
+from drivetrain_jax.runs.scene import Problem, Scene, result_variables
 from drivetrain_jax.store import provenance
 from drivetrain_jax.store.consolidate import release
 from drivetrain_jax.store.schema import CONVENTIONS, Coordinate, Labelled
@@ -24,30 +25,30 @@ from drivetrain_jax.systems import System
 if TYPE_CHECKING:
     import xarray as xr
 
-# Bytes of the plan per point; an upper limit for small chunks.
-_PLANNED = 4
-# Bytes of mapped results kept in memory; values blanked at a time.
-_RESIDENT, _ROWS = 1 << 26, 1 << 22
+# Code of points that are not computed yet, which no finished result contains.
+PENDING = len(Outcome)
+# Bytes of mapped results kept in memory.
+_RESIDENT = 1 << 26
 _STORAGE = ("h5py",)
 
 
 class ResultBuffer:
-    """Results of all points of a grid, filled chunk by chunk.
-
-    A point that is never filled has no value and the outcome ``step_limit``.
+    """Results of all points of a grid, filled block by block.
 
     ``arrays`` holds all values: the axes in scene order (or the points), then the dimensions of the result.
-    ``allocate(template)`` returns such arrays for a labelled result (default: in memory).
+    ``allocate(template)`` returns such arrays for a labelled result (default: in memory). A point that is never filled is
+    undefined, or has no value and the outcome ``blank``.
     """
 
     def __init__(
-        self, scene: Scene, grid: Grid, allocate: Callable[[Labelled], Mapping[str, np.ndarray]] | None = None
+        self,
+        scene: Scene,
+        grid: Grid,
+        allocate: Callable[[Labelled], Mapping[str, np.ndarray]] | None = None,
+        blank: int | None = None,
     ) -> None:
         self.variables = result_variables(scene)
-        self._scene, self._grid = scene, grid
-        self._allocate = allocate
-        self._sizes = {d.name: len(d.values) for d in scene.dimensions}
-        self._lost: list[np.ndarray] = []
+        self._scene, self._grid, self._allocate, self._blank = scene, grid, allocate, blank
         self._unreleased = 0
         self.arrays: Mapping[str, np.ndarray] = {}
 
@@ -59,9 +60,10 @@ class ResultBuffer:
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
         """Write the results of ``points``."""
         self._lay_out_for(results)
-        for name, values in results.items():
+        for variable in self.variables:
+            values = results[variable.name]
             # A fixed path parameter is not a dimension of the result.
-            enter(self.arrays[name], self._grid, points, values[:, 0] if self._grid.path_is_fixed else values)
+            enter(self.arrays[variable.name], self._grid, points, values[:, 0] if self._grid.path_is_fixed else values)
         self.release_after(results)
 
     def block(self, place: tuple[slice, ...], like: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -69,7 +71,7 @@ class ResultBuffer:
 
         ``like`` holds the results of one point.
         """
-        self._lay_out_for(like, blank=False)
+        self._lay_out_for(like)
         return {name: values[place] for name, values in self.arrays.items()}
 
     def release_after(self, results: Mapping[str, np.ndarray]) -> None:
@@ -79,45 +81,28 @@ class ResultBuffer:
             self._unreleased = 0
             release(self.arrays.values())
 
-    def _lay_out_for(self, results: Mapping[str, np.ndarray], *, blank: bool = True) -> None:
+    def _lay_out_for(self, results: Mapping[str, np.ndarray]) -> None:
         """Create the arrays; the first results give the lengths of dimensions that depend on the system."""
         if not self.arrays:
+            sizes = {d.name: len(d.values) for d in self._scene.dimensions}
             for variable in self.variables:
-                self._sizes |= zip(reversed(variable.dims), reversed(results[variable.name].shape), strict=False)
-            self.lay_out(blank=blank)
+                sizes |= zip(reversed(variable.dims), reversed(results[variable.name].shape), strict=False)
+            self._create(sizes)
 
-    def lose(self, points: np.ndarray) -> None:
-        """Mark these points as lost: their worker crashed three times."""
-        self._lost.append(points)
-        if self.arrays:
-            self._mark_lost()
-
-    def _mark_lost(self) -> None:
-        for points in self._lost:
-            enter(self.arrays[OUTCOME.name], self._grid, points, Outcome.LOST)
-        self._lost.clear()
-
-    def lay_out(self, *, blank: bool = True) -> Mapping[str, np.ndarray]:
-        """The arrays, which are created if nothing has been filled; without ``blank`` new arrays have undefined content."""
+    def lay_out(self) -> Mapping[str, np.ndarray]:
+        """The arrays, which are created if nothing has been filled."""
         if not self.arrays:
-            if not all(self._sizes[dim] for variable in self.variables for dim in variable.dims):
-                # No point has a result, but the solver knows these lengths.
-                self._sizes |= dimension_sizes(self._scene, self._grid)
-            sweep = self._grid.result_shape
-            shapes = {v: (*sweep, *(self._sizes[dim] for dim in v.dims)) for v in self.variables}
-            if self._allocate is None:
-                self.arrays = {v.name: np.empty(shape, v.dtype) for v, shape in shapes.items()}
-            else:
-                # Broadcast zeros take no memory.
-                zeros = {v.name: np.broadcast_to(np.zeros((), v.dtype), shape) for v, shape in shapes.items()}
-                self.arrays = self._allocate(labelled(self._scene, zeros, {}))
-            for variable in self.variables if blank else ():
-                rows = self.arrays[variable.name].reshape(-1)
-                for start in range(0, rows.size, _ROWS):
-                    rows[start : start + _ROWS] = missing_value(variable)
-                    release([self.arrays[variable.name]])
-            self._mark_lost()
+            self._create(dimension_sizes(self._scene, self._grid))
         return self.arrays
+
+    def _create(self, sizes: Mapping[str, int]) -> None:
+        if self._allocate is None:
+            shapes = {v: (*self._grid.result_shape, *(sizes[dim] for dim in v.dims)) for v in self.variables}
+            self.arrays = {v.name: np.empty(shape, v.dtype) for v, shape in shapes.items()}
+        else:
+            self.arrays = self._allocate(template(self._scene, self._grid, {}, sizes))
+        for variable in self.variables if self._blank is not None else ():
+            self.arrays[variable.name][...] = self._blank if variable.name == OUTCOME.name else variable.missing
 
 
 def enter(array: np.ndarray, grid: Grid, points: np.ndarray, values: np.ndarray | int) -> None:
@@ -134,22 +119,12 @@ def sweep_first(array: np.ndarray, grid: Grid) -> np.ndarray:
     return array if position is None else np.moveaxis(array, position, len(grid.shape))
 
 
-def failures(outcome: np.ndarray) -> int:
-    """Number of outcomes without a value."""
-    return int(np.count_nonzero(outcome >= FIRST_FAILURE))
-
-
-def inaccurate(outcome: np.ndarray) -> int:
-    """Number of outcomes with a value whose error exceeds the target."""
-    return int(np.count_nonzero(outcome == Outcome.TOLERANCE_NOT_MET))
-
-
 def missing_value(variable: Variable) -> float | int:
     """The value that marks a missing result of ``variable``."""
     return Outcome.STEP_LIMIT if variable.name == OUTCOME.name else variable.missing
 
 
-def dimension_sizes(scene: Scene, grid: Grid) -> dict[str, int]:
+def dimension_sizes(scene: Problem, grid: Grid) -> dict[str, int]:
     """Lengths of the dimensions of the results besides those of the sweep, those that depend on the system included."""
     sizes, variables = {d.name: len(d.values) for d in scene.dimensions}, result_variables(scene)
     if not all(sizes[dim] for variable in variables for dim in variable.dims):
@@ -162,11 +137,6 @@ def dimension_sizes(scene: Scene, grid: Grid) -> dict[str, int]:
     return sizes
 
 
-def bytes_per_point(scene: Scene, on_disk: bool) -> int:
-    """Bytes of memory per point during a run: the plan, and the results unless they are in a file."""
-    return _PLANNED if on_disk else _PLANNED + scene.result_bytes
-
-
 def labelled(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str, str | float]) -> Labelled:
     """The labelled result: dimensions are the axes in scene order (or ``point``), then those of the variable."""
     sweep_dims = ("point",) if scene.zipped else tuple(axis.dim for axis in scene.axes)
@@ -174,6 +144,26 @@ def labelled(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str,
     return Labelled.build(
         sweep_dims, axis_coordinates(scene), scene.dimensions, results, result_attrs(scene) | dict(attrs)
     )
+
+
+def template(
+    scene: Scene, grid: Grid, attrs: Mapping[str, str | float], sizes: Mapping[str, int] | None = None
+) -> Labelled:
+    """The labelled result with zeros, which take no memory, for its data."""
+    sizes, zeros = dimension_sizes(scene, grid) if sizes is None else sizes, {}
+    for v in result_variables(scene):
+        shape = (*grid.result_shape, *(sizes[dim] for dim in v.dims))
+        zeros[v.name] = np.broadcast_to(np.zeros((), v.dtype), shape)
+    return labelled(scene, zeros, attrs)
+
+
+def with_pending(result: Labelled) -> Labelled:
+    """``result`` with the meaning of the code ``PENDING`` added."""
+    outcome = result.data[OUTCOME.name]
+    meanings = f"{outcome.attrs['flag_meanings']} pending"
+    codes = np.arange(PENDING + 1, dtype=OUTCOME.dtype)
+    entry = replace(outcome, attrs={**outcome.attrs, "flag_values": codes, "flag_meanings": meanings})
+    return replace(result, data={**result.data, OUTCOME.name: entry})
 
 
 def to_dataset(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str, str | float]) -> xr.Dataset:

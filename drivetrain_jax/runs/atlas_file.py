@@ -22,7 +22,7 @@ from drivetrain_jax.atlas.floquet import floquet_domain
 from drivetrain_jax.runs.assemble import ResultBuffer, labelled, result_attrs, to_dataset
 from drivetrain_jax.runs.atlas_values import as_given, broadcast, check_same
 from drivetrain_jax.runs.axes import Axis
-from drivetrain_jax.runs.executor import Threads
+from drivetrain_jax.runs.executors import Threads
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.physical import in_parameters
 from drivetrain_jax.runs.programs import kept

@@ -6,9 +6,10 @@ from pathlib import Path
 
 from drivetrain_jax.runs.atlas_choice import atlas_ranges
 from drivetrain_jax.runs.atlas_file import to_labelled
-from drivetrain_jax.runs.growing import ReusedPoints
-from drivetrain_jax.runs.job import Job, Route
+from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.reuse import ReusedPoints
 from drivetrain_jax.runs.rounds import build_atlas
+from drivetrain_jax.runs.routes import Route
 from drivetrain_jax.runs.work import Progress, Work
 from drivetrain_jax.store.consolidate import write_result
 from drivetrain_jax.store.files import ATLAS_PREFACE
@@ -19,10 +20,7 @@ class AtlasRoute(Route):
     """Builds an atlas; progress counts its solves, which are not points of a grid."""
 
     name = "an atlas"
-
-    def progress(self, job: Job) -> Progress:
-        """The counts before a run."""
-        return Progress(0, kind="direct solves")
+    is_pointwise = False
 
     def in_memory(self, job: Job, work: Work, progress: Progress) -> Labelled:
         """The atlas; ``progress`` counts the solves."""

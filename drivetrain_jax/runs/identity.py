@@ -22,7 +22,7 @@ PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "nump
 _ROOT = Path(drivetrain_jax.__file__).parent
 # Folders and files of this package that compute numbers, and the files in these folders that only read results.
 _FOLDERS = ("systems", "analysis", "atlas")
-_ENGINE = ("atlas_choice", "kernel", "over", "plan", "point_grid", "rounds", "through_atlas")
+_ENGINE = ("atlas_choice", "job", "kernel", "over", "plan", "point_grid", "rounds", "through_atlas")
 _FILES = ("_quantities", "resonances", "store/shards", *(f"runs/{name}" for name in _ENGINE))
 _READER = "figure.py"
 

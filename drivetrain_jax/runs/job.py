@@ -1,14 +1,14 @@
-"""A job: a scene resolved once into its route, solvers, plan and kernels, which computes single chunks."""
+"""A job: a scene resolved once into its route, solvers, blocks and kernels, which computes chunks and blocks."""
 
 from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Set
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from functools import cached_property, lru_cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -18,82 +18,43 @@ from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax._precision import use_double_precision
 from drivetrain_jax._threads import threads
 from drivetrain_jax.analysis import Solver
+from drivetrain_jax.runs.assemble import dimension_sizes, missing_value
 from drivetrain_jax.runs.identity import numerics_of, scene_digest
-from drivetrain_jax.runs.kernel import Kernel, for_device, is_small, kernel_of
-from drivetrain_jax.runs.plan import Chunk, Plan, make_plan
+from drivetrain_jax.runs.kernel import FEW, LIGHT, Kernel, for_device, kernel_of
+from drivetrain_jax.runs.plan import Chunk, block_size, make_plan
 from drivetrain_jax.runs.point_grid import Grid
-from drivetrain_jax.runs.scene import Problem, Scene
+from drivetrain_jax.runs.scene import Problem, Scene, result_variables
 from drivetrain_jax.store.provenance import digest
+from drivetrain_jax.store.shards import Shards
 
 if TYPE_CHECKING:
-    from drivetrain_jax.runs.growing import NotReusable, ReusableResult, ReusedPoints
-    from drivetrain_jax.runs.work import Progress, Work
-    from drivetrain_jax.store.chunks import Part
-    from drivetrain_jax.store.schema import Labelled
+    from drivetrain_jax.runs.routes import Route
 
 # Most kernels that are compiled in parallel.
 _SIDE_BY_SIDE = 8
 
+Results = Mapping[str, np.ndarray]
 
-class Route(Protocol):
-    """The way from a job to its result, chosen once by :func:`~drivetrain_jax.runs.resolve.resolve`."""
 
-    # Name of the route; a part of the digest, because the route affects the bits.
-    name: str
-    # True if points are solved one by one, so that partial results can be opened, reused and written.
-    is_pointwise: bool = False
+@dataclass(frozen=True)
+class Block:
+    """A box of the grid, the unit of computing, storing and resuming; ``some`` of its points if not all are computed."""
 
-    def total(self, job: Job, done: int) -> int:
-        """Number of all results, given that ``done`` of them exist."""
-        return done
-
-    def bytes_needed(self, job: Job, on_disk: bool) -> int:
-        """Least memory of a run; 0 if it cannot be predicted."""
-        return 0
-
-    def progress(self, job: Job) -> Progress:
-        """The counts before a run."""
-        ...
-
-    def counts(self, part: Part) -> bool:
-        """True if the chunks of a part count as done."""
-        return True
-
-    def rearranged(self, job: Job, path: Path) -> list[str]:
-        """Names of the variables of the result at ``path`` whose layout differs from that of the job."""
-        return []
-
-    def common_points(self, job: Job, path: Path) -> ReusableResult | NotReusable | None:
-        """Points of the job in the result at ``path``, the reason why it has none, or None for a result without points."""
-        return None
-
-    def in_memory(self, job: Job, work: Work, progress: Progress) -> Labelled:
-        """The result."""
-        ...
-
-    def into_file(
-        self, job: Job, out: Path, temporary: Path, work: Work, progress: Progress, reused: ReusedPoints
-    ) -> None:
-        """Write the result to ``out``, growing at ``temporary``."""
-        ...
+    number: int
+    some: np.ndarray | None = None
 
 
 class Job:
-    """A problem and the route to its result. Plan and kernels are created on first use.
+    """A problem and the route to its result. Blocks and kernels are created on first use.
 
-    ``points`` restricts the plan to these points of the grid; for ``full_size`` see :func:`make_plan`. Jobs are equal if
-    they have the same digest. A pickled job lacks ``points``: it only computes given chunks.
+    Its kernels keep their chunk size for few points if ``full_size``. Jobs are equal if they have the same digest.
     """
 
-    def __init__(
-        self, problem: Problem, route: Route, points: np.ndarray | None = None, *, full_size: bool = False
-    ) -> None:
+    def __init__(self, problem: Problem, route: Route, *, full_size: bool = False) -> None:
         self.problem, self.route = problem, route
-        self._points, self._full_size = points, full_size
+        self._full_size = full_size
         self._kernels: dict[tuple[int, int], Future[Kernel]] = {}
         self._lock = threading.Lock()
-        # The part of the plan for one block, with chunks numbered from 0, made without the rest of the plan.
-        self.block_plan = lru_cache(maxsize=4)(self._block_plan)
 
     @cached_property
     def grid(self) -> Grid:
@@ -115,17 +76,13 @@ class Job:
         return self.problem
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (self.problem, self.route, self._full_size)
+        return _restored, (self.problem, self.route, self._full_size, self.boxes)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Job) and other.digest == self.digest
 
     def __hash__(self) -> int:
         return hash(self.digest)
-
-    def only(self, points: np.ndarray) -> Job:
-        """The job restricted to these points of the grid."""
-        return Job(self.problem, self.route, points, full_size=self._full_size)
 
     @cached_property
     def numerics(self) -> str:
@@ -147,60 +104,62 @@ class Job:
         """Attributes that identify the result; effort and time are added at the end."""
         return {"digest": self.digest, **self.numerics_attrs, "wall_time_s": 0.0}
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """Digest of everything that affects the result."""
-        return self._digest
-
-    @cached_property
-    def _digest(self) -> str:
         return scene_digest(self.problem, self.solvers, self.numerics)
-
-    @cached_property
-    def plan(self) -> Plan:
-        """Solver and chunk of every point."""
-        return make_plan(self.solvers, self.grid, self._points, full_size=self._full_size)
-
-    def _block_plan(self, block: int) -> Plan:
-        full_size = self._full_size or self.grid.shards.count > 1
-        return make_plan(self.solvers, self.grid, np.arange(*self.grid.block(block)), full_size=full_size)
-
-    @cached_property
-    def _small(self) -> bool:
-        def plan() -> Plan:
-            return self.plan if self._points is None else make_plan(self.solvers, self.grid)
-
-        return not self._full_size and is_small(self.grid, plan)
 
     @property
     def total(self) -> int:
         """Number of results; every point of a path counts."""
-        return (self.grid.size if self._points is None else len(self._points)) * self.grid.path_length
+        return self.grid.size * self.grid.path_length
 
-    @property
-    def unsolvable(self) -> int:
-        """Number of points that no solver can compute; they have no value."""
-        return self.total - self.plan.size * self.grid.path_length
+    @cached_property
+    def boxes(self) -> Shards:
+        """The boxes of the blocks."""
+        grid = self.grid
+        return Shards.of(grid.result_shape, grid.path_position, block_size(self.solvers, grid))
 
-    def ordered(self, numbers: Iterable[int]) -> Iterator[Chunk]:
-        """Yield the chunks with these numbers in the order of computation, each created on demand."""
-        return iter(_Chunks(self.plan, self.plan.ordered(numbers)))
+    @cached_property
+    def _starts(self) -> np.ndarray:
+        return self.boxes.starts(self.grid.path_position)
 
-    def prepare(self, kernels: Set[tuple[int, int]]) -> None:
-        """Start compiling kernels (position of the solver, chunk size) in parallel, without waiting."""
+    def blocks(self, points: np.ndarray | None = None) -> Iterator[Block]:
+        """Yield all blocks, or those with some of these (rising) ``points`` of the grid, restricted to them."""
+        ends = None if points is None else np.searchsorted(points, self._starts)
+        for number in range(self.boxes.count):
+            if ends is None or points is None:
+                yield Block(number)
+            elif ends[number] < ends[number + 1]:
+                yield Block(number, points[ends[number] : ends[number + 1]])
+
+    def points(self, block: Block) -> np.ndarray:
+        """Numbers of the points of a block."""
+        return np.arange(*self._starts[block.number : block.number + 2]) if block.some is None else block.some
+
+    def plan(self, block: Block) -> tuple[Chunk, ...]:
+        """The chunks of a block."""
+        full_size = self._full_size or self.boxes.count > 1
+        return make_plan(self.solvers, self.grid, self.points(block), full_size=full_size)
+
+    @cached_property
+    def _few(self) -> bool:
+        """True if the whole grid is so cheap that its kernels are not worth optimising."""
+        if self._full_size or self.total > FEW or self.boxes.count > 1:
+            return False
+        return sum(chunk.cost for chunk in self.plan(Block(0))) <= LIGHT
+
+    def prepare(self, chunks: Sequence[Chunk]) -> None:
+        """Start compiling the kernels of ``chunks`` in parallel, without waiting."""
         with self._lock:
-            missing = kernels - self._kernels.keys()
-            if not missing:
-                return
-            pool = threads(_SIDE_BY_SIDE, "compile")
-            for index, size in missing:
-                solver = self.solvers[index]
-                few = self._small and not solver.lengthy
+            for index, size in {(chunk.solver, chunk.size): None for chunk in chunks}.keys() - self._kernels.keys():
+                solver, pool = self.solvers[index], threads(_SIDE_BY_SIDE, "compile")
+                few = self._few and not solver.lengthy
                 self._kernels[index, size] = pool.submit(kernel_of, self.problem, self.grid, solver, size, few)
 
-    def compute(self, chunk: Chunk) -> Mapping[str, np.ndarray]:
+    def compute(self, chunk: Chunk) -> Results:
         """Results of one chunk; thread-safe. Raises :class:`ChunkError`."""
-        self.prepare({(chunk.solver, chunk.size)})
+        self.prepare([chunk])
         try:
             kernel = self._kernels[chunk.solver, chunk.size].result()
             return kernel(self.grid.columns(chunk.points), self.grid.numbers, chunk.effort)
@@ -208,26 +167,41 @@ class Job:
             # The error of a model or of an analysis, the same for all chunks.
             raise ChunkError(str(error)) from error
         except Exception as error:
-            solver = self.solvers[chunk.solver].name
-            kind = RetryableError if _is_retryable(error) else ChunkError
-            raise kind(f"chunk {chunk.number} ({solver}): {type(error).__name__}: {error}") from error
+            # XLA raises its own exception for lack of memory.
+            passes = isinstance(error, (OSError, MemoryError)) or "RESOURCE_EXHAUSTED" in str(error)
+            kind = RetryableError if passes else ChunkError
+            raise kind(f"{self.solvers[chunk.solver].name}: {type(error).__name__}: {error}") from error
+
+    def compute_block(self, block: Block) -> Results:
+        """Results of one block, in this thread."""
+        chunks = self.plan(block)
+        return self.joined(block, chunks, list(map(self.compute, chunks)))
+
+    def joined(self, block: Block, chunks: Sequence[Chunk], results: Sequence[Results]) -> Results:
+        """The results of all ``chunks`` of a block in the order of its points; others have no value."""
+        count = len(self.points(block))
+        rows = np.concatenate([np.empty(0, np.int64), *(chunk.rows for chunk in chunks)])
+        shapes = {name: values.shape[1:] for name, values in results[0].items()} if results else self._shapes
+        found = {}
+        for variable in result_variables(self.problem):
+            shape, blank = (count, *shapes[variable.name]), missing_value(variable)
+            values = np.empty(shape, variable.dtype) if rows.size == count else np.full(shape, blank, variable.dtype)
+            if results:
+                values[rows] = np.concatenate([each[variable.name] for each in results])
+            found[variable.name] = values
+        return found
+
+    @property
+    def _shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of the results of a point or line, without computing one."""
+        sizes, line = dimension_sizes(self.problem, self.grid), (self.grid.path_length,) * (self.grid.path is not None)
+        return {v.name: (*line, *(sizes[dim] for dim in v.dims)) for v in result_variables(self.problem)}
 
 
-class _Chunks:
-    """Chunks of a plan, created one by one; iterators over them have a length hint."""
-
-    def __init__(self, plan: Plan, numbers: np.ndarray) -> None:
-        self._plan, self._numbers = plan, numbers
-
-    def __len__(self) -> int:
-        return len(self._numbers)
-
-    def __getitem__(self, position: int) -> Chunk:
-        return self._plan.chunk(self._numbers[position])
-
-
-def _restored(problem: Problem, route: Route, full_size: bool) -> Job:
-    return Job(problem, route, full_size=full_size)
+def _restored(problem: Problem, route: Route, full_size: bool, boxes: Shards) -> Job:
+    job = Job(problem, route, full_size=full_size)
+    job.boxes = boxes
+    return job
 
 
 def _check_double_precision() -> None:
@@ -236,8 +210,3 @@ def _check_double_precision() -> None:
         use_double_precision()
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise InputError("jax_enable_x64 = False: set by the context of this call; allowed is jax.enable_x64(True)")
-
-
-def _is_retryable(error: Exception) -> bool:
-    # XLA raises its own exception for lack of memory.
-    return isinstance(error, (OSError, MemoryError)) or "RESOURCE_EXHAUSTED" in str(error)

@@ -18,7 +18,6 @@ from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import Analysis, Solver
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, on_cpu, options_for_few
 from drivetrain_jax.runs.identity import program_identity
-from drivetrain_jax.runs.plan import Plan
 from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.programs import calls, compiled
 from drivetrain_jax.runs.scene import Problem, result_variables
@@ -27,7 +26,7 @@ from drivetrain_jax.systems import System
 _LAPACK = threading.Lock()
 # Up to this number of points and this predicted cost (in units of the plan), computing takes less time than optimising the
 # kernels.
-_FEW, _LIGHT = 128, 3e4
+FEW, LIGHT = 128, 3e4
 # Kernels that a process keeps, of up to 40 MB each. Every list of fixed values and every path has its own.
 _KEPT = 16
 # GPU chunk size: 64 times the CPU size, at most 32,768.
@@ -114,11 +113,6 @@ def compile_kernel(
 def for_device(solver: Solver) -> Solver:
     """``solver`` with the chunk size that suits the device of this process."""
     return solver if on_cpu() else replace(solver, chunk=max(solver.chunk, min(_WIDER * solver.chunk, _WIDEST)))
-
-
-def is_small(grid: Grid, plan: Callable[[], Plan]) -> bool:
-    """True if the whole grid, of which ``plan`` makes the plan, is so cheap that its kernels are not worth optimising."""
-    return bool(grid.size * grid.path_length <= _FEW and plan().costs.sum() <= _LIGHT)
 
 
 @dataclass(frozen=True)

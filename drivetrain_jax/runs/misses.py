@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.store import gate
+from drivetrain_jax.store.reading import opened
 
 _BOUND, _VERDICT, _UNDECIDED = "spectral_radius_error", "verdict", 2
 
@@ -20,8 +20,7 @@ def missed(out: Path, count: int, total: int) -> str:
     mark = f"{OUTCOME.name} = {int(Outcome.TOLERANCE_NOT_MET)} marks {'it' if count == 1 else 'them'}"
     if out.is_dir():
         return f"{text}; {mark}"
-    with gate.opened(out) as opened:
-        file: Any = opened
+    with cast(Any, opened(out)) as file:
         rtol = json.loads(file.attrs.get("options", "{}")).get("rtol")
         text += f" {rtol:g}" if rtol else ""
         outcome = file[OUTCOME.name]

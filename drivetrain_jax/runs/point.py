@@ -271,9 +271,8 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
 
 def _compute(job: Job) -> ResultBuffer:
     buffer = ResultBuffer(job.scene, job.grid)
-    for number in range(len(job.plan.costs)):
-        chunk = job.plan.chunk(number)
-        buffer.fill(chunk.points, job.compute(chunk))
+    for block in job.blocks():
+        buffer.fill(job.points(block), job.compute_block(block))
     return buffer
 
 

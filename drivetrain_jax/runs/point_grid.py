@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -13,7 +12,6 @@ import numpy as np
 
 from drivetrain_jax.runs.axes import Axis
 from drivetrain_jax.runs.scene import Problem, Value
-from drivetrain_jax.store.shards import Shards
 
 
 @dataclass(frozen=True)
@@ -81,21 +79,6 @@ class Grid:
         if self.path_position is None:
             return self.shape
         return (*self.shape[: self.path_position], self.path_length, *self.shape[self.path_position :])
-
-    @cached_property
-    def shards(self) -> Shards:
-        """The boxes in which points are planned, and which a Zarr store stores as its shards."""
-        return Shards.of(self.result_shape, self.path_position, self.result_bytes)
-
-    @cached_property
-    def starts(self) -> np.ndarray:
-        """First point of every block (shard), and the number of all points."""
-        return self.shards.starts(self.path_position)
-
-    def block(self, number: int) -> tuple[int, int]:
-        """First point of a block, and the first one after it."""
-        first, stop = self.starts[number : number + 2]
-        return int(first), int(stop)
 
     def place(self, points: np.ndarray) -> tuple[Any, ...]:
         """Index of ``points`` in an array of shape ``shape``."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from drivetrain_jax.runs.atlas_choice import choose_atlas
-from drivetrain_jax.runs.job import Job, Route
-from drivetrain_jax.runs.routes import DIRECT
+from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.routes import DIRECT, Route
 from drivetrain_jax.runs.scene import Scene
 
 

@@ -1,4 +1,4 @@
-"""Build an atlas from direct solves. Every round is a plan of chunks, stored and resumed like any other."""
+"""Build an atlas from direct solves. Every round is a job of blocks, stored and resumed like any other."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def build_atlas(
     progress: Progress,
     max_solves: int | None = None,
 ) -> tuple[StabilityAtlas, int]:
-    """The atlas of ``scene`` over ``ranges``, and the first free chunk number.
+    """The atlas of ``scene`` over ``ranges``, and the first free number of a block.
 
     ``progress`` counts the solves and notes gaps.
     """
@@ -58,7 +58,7 @@ def build_atlas(
         answers = _Answers(len(points), width)
         progress.total += len(points)
         work.do(job, answers, progress, first)
-        first += len(job.plan.costs)
+        first += job.boxes.count
         values = answers.values
 
 
@@ -118,6 +118,3 @@ class _Answers:
 
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
         self.values[points] = np.concatenate([results[name] for name in SOLVES.default_outputs], axis=1)
-
-    def lose(self, points: np.ndarray) -> None:
-        """Do nothing: missing points are NaN."""

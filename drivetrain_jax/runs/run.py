@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax._machine import physical_memory
 from drivetrain_jax._wording import shown
-from drivetrain_jax.runs.executor import Executor, Threads
-from drivetrain_jax.runs.executors import make_executor
-from drivetrain_jax.runs.growing import ReusedPoints
+from drivetrain_jax.runs.executors import Executor, Threads, make_executor
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.notebook import shown_progress
-from drivetrain_jax.runs.output_state import OutputState
+from drivetrain_jax.runs.output import HDF5, ZARR, Output
 from drivetrain_jax.runs.resolve import resolve
+from drivetrain_jax.runs.reuse import ReusedPoints
 from drivetrain_jax.runs.scene import Scene, load_scene
+from drivetrain_jax.runs.stores import ZarrBlocks
 from drivetrain_jax.runs.work import Progress, Report, Work
 from drivetrain_jax.store.consolidate import open_result
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class Incomplete(RuntimeError):
-    """Raised when a run stops before its end; finished chunks are kept. ``progress`` holds the counts."""
+    """Raised when a run stops before its end; finished blocks are kept. ``progress`` holds the counts."""
 
     def __init__(self, reason: str, progress: Progress) -> None:
         super().__init__(reason)
@@ -34,7 +34,7 @@ class Incomplete(RuntimeError):
 
 
 class Interrupted(KeyboardInterrupt):
-    """Raised when the user interrupts a run; finished chunks are kept. ``progress`` holds the counts."""
+    """Raised when the user interrupts a run; finished blocks are kept. ``progress`` holds the counts."""
 
     def __init__(self, progress: Progress) -> None:
         super().__init__("interrupted")
@@ -64,13 +64,14 @@ def run(
         overrides: entries to replace, by dotted key: ``{"fixed.zeta": 0.002}``.
         fresh: compute all points again and replace what is at ``out``. The same call resumes an interrupted run.
         threads: number of threads of this process (default: the usable cores).
-        workers: number of processes instead of threads. A script needs the guard ``if __name__ == "__main__"``.
-        dask: Dask cluster instead of threads: ``tcp://host:port``, or ``local:N`` processes.
+        workers: number of Dask processes instead of threads, the same as ``dask="local:N"``.
+        dask: Dask cluster instead of threads: ``tcp://host:port``, or ``local:N`` processes. A script that starts processes
+            needs the guard ``if __name__ == "__main__"``.
         reuse: path(s) of results whose common points are reused; needs ``out``. A smaller result at ``out`` always is.
         report: called with the :class:`Progress` after every chunk; by default a notebook shows a bar.
 
     Raises: :class:`InputError` with one line that names the field, the value and the allowed values, before anything is
-    computed or written; :class:`Incomplete` if the run failed. Finished chunks stay. It says if the same call may resume.
+    computed or written; :class:`Incomplete` if the run failed. Finished blocks stay. It says if the same call may resume.
 
     >>> import drivetrain_jax as dt
     >>> axes = {"k_sp": {"values": [4e8, 5e8]}}
@@ -88,7 +89,7 @@ def run(
 
 
 def _check_output(out: object, reuse: object) -> None:
-    if out is not None and (not isinstance(out, (str, PathLike)) or "\0" in str(out)):
+    if out is not None and not isinstance(out, (str, PathLike)):
         raise InputError(f"out = {shown(out)}: allowed is the path of a file")
     if out is None and reuse:
         raise InputError("reuse: given without out; allowed is a run into a file")
@@ -107,15 +108,15 @@ def run_to_file(
 ) -> Progress:
     """Like :func:`run` with ``out``, but returns the counts instead of the result.
 
-    ``store`` is ``hdf5``, or ``zarr`` if workers write a Zarr store (see :mod:`.zarr_sink`); by default the name of ``out``
-    decides.
+    ``store`` is ``hdf5`` or ``zarr``, of which each block is a shard; by default the name of ``out`` decides.
     """
     job = _job(scene, overrides, on_disk=True)
-    output = OutputState(out, job, _store(out, store))
-    output.sink.check_job(job)
+    output = Output(out, job, _store(out, store))
+    if output.store == ZARR and not job.route.is_pointwise:
+        raise InputError("store = 'zarr': not available for an atlas; allowed is hdf5, or a scene with direct solves")
     output.restore()
     if not fresh and output.state == "complete":
-        output.parts.discard(output.digest, output.sink.written)
+        output.discard()
         total = output.points(job.total)
         progress = Progress(total, reused=total)
         progress.count(output.outcomes)
@@ -129,12 +130,12 @@ def run_to_file(
 
 
 def _store(out: Path, given: str | None) -> str:
-    """The store for ``out``, ``hdf5`` or ``zarr``; :class:`InputError` for an HDF5 file with the name of a Zarr store."""
+    """The store for ``out``; :class:`InputError` for an HDF5 file with the name of a Zarr store."""
     named = out.suffix.lower() == ".zarr"
-    if named and given == "hdf5":
+    if named and given == HDF5:
         allowed = f"allowed is a name such as {out.stem}.nc, or `drivetrain run --store zarr`"
         raise InputError(f"out = {str(out)!r}: names a Zarr store; {allowed}")
-    return given or ("zarr" if named else "hdf5")
+    return given or (ZARR if named else HDF5)
 
 
 def _paths(reuse: str | Path | Sequence[str | Path]) -> Sequence[str | Path]:
@@ -144,11 +145,9 @@ def _paths(reuse: str | Path | Sequence[str | Path]) -> Sequence[str | Path]:
     return paths
 
 
-def _into(
-    output: OutputState, reused: ReusedPoints, fresh: bool, executor: Executor, report: Report | None
-) -> Progress:
+def _into(output: Output, reused: ReusedPoints, fresh: bool, executor: Executor, report: Report | None) -> Progress:
     """Start or resume the result of ``output``; the points ``reused`` are reused."""
-    job, parts, progress = output.job, output.parts, output.job.route.progress(output.job)
+    job, parts, progress = output.job, output.parts, _progress(output.job)
     begins = False
     try:
         parts.open()
@@ -156,7 +155,13 @@ def _into(
         begins = not output.resumes(reused, fresh)
         if begins:
             parts.start(output.plan(reused, fresh))
-        output.sink.write(job, executor, report, progress, reused)
+        with Work(executor, report, output.blocks) as work:
+            if isinstance(work.store, ZarrBlocks):
+                work.store.create()
+                work.do(job, None, progress)
+                work.store.finish(parts, wall_time_s=work.elapsed)
+            else:
+                job.route.into_file(job, output.out, parts.result, work, progress, reused)
         parts.close(remove=True)
     except KeyboardInterrupt:
         raise Interrupted(progress) from None
@@ -174,18 +179,23 @@ def _into(
     return progress
 
 
+def _progress(job: Job) -> Progress:
+    """The counts before a run; those of an atlas are solves, which are not points of a grid."""
+    return Progress(0, kind="direct solves") if job.scene.analysis.continuous else Progress(job.total)
+
+
 def _job(scene: str | Path | Mapping[str, Any] | Scene, overrides: Mapping[str, Any] | None, on_disk: bool) -> Job:
     """The job of a scene, checked against the memory of this machine."""
     job = resolve(scene if isinstance(scene, Scene) else load_scene(scene, overrides))
-    needed, present = job.route.bytes_needed(job, on_disk), physical_memory()
-    if needed > present:
+    needed = 0 if on_disk or job.scene.analysis.continuous else job.total * job.scene.result_bytes
+    if needed > (present := physical_memory()):
         limit = f"allowed here is up to {present / 1e9:.0f} GB"
         raise InputError(f"axes: {job.total} points need {needed / 1e9:.0f} GB of memory; {limit}")
     return job
 
 
 def _in_memory(job: Job, executor: Executor, report: Report | None) -> xr.Dataset:
-    progress = job.route.progress(job)
+    progress = _progress(job)
     try:
         with Work(executor, report) as work:
             result = job.route.in_memory(job, work, progress)

@@ -1,22 +1,27 @@
-"""The state of a result file compared with its scene."""
+"""The state of a result compared with its scene, and unfinished work as a labelled result."""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.runs.output_state import OutputState
+from drivetrain_jax.runs.assemble import PENDING, ResultBuffer, labelled, with_pending
+from drivetrain_jax.runs.output import Output
 from drivetrain_jax.runs.resolve import resolve
-from drivetrain_jax.runs.scene import load_scene
-from drivetrain_jax.runs.shard_writer import block_of
+from drivetrain_jax.runs.scene import load_scene, restore_scene
+from drivetrain_jax.store import checksums, consolidate
+from drivetrain_jax.store.parts import PartsFolder
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 @dataclass(frozen=True)
@@ -56,7 +61,7 @@ def status(
 ) -> Status:
     """The :class:`Status` of ``scene`` at ``out``. Changes nothing and compiles nothing."""
     job = resolve(load_scene(scene, overrides))
-    output, total = OutputState(Path(out), job), job.route.total(job, 0)
+    output, total = Output(Path(out), job), 0 if job.scene.analysis.continuous else job.total
     if output.state == "stale":
         reason = f"it holds {output.obstacle}; {output.remedy}"
         return Status(total, 0, 0, output.state, reason=reason)
@@ -67,7 +72,7 @@ def status(
     done = output.points(codes.total()) if output.state == "complete" else codes.total()
     without = {o.name.lower(): codes[o] for o in Outcome if not o.has_value and codes[o]}
     return Status(
-        job.route.total(job, done),
+        total or done,
         done,
         sum(without.values()),
         output.state,
@@ -77,27 +82,55 @@ def status(
     )
 
 
-def _codes(output: OutputState) -> Counter[int]:
-    """Number of finished points by outcome."""
-    codes = Counter[int]()
-    for outcome in _outcomes(output):
+def _codes(output: Output) -> Counter[int]:
+    """Number of finished points by outcome; of an atlas, number of finished solves."""
+    job, codes = output.job, Counter[int]()
+    if output.state == "complete":
+        found = [output.outcomes]
+    elif output.state != "partial":
+        found = []
+    elif job.scene.analysis.continuous:
+        stored = (output.blocks.read(number) for number in output.blocks.numbers())
+        found = (results[OUTCOME.name] for results in stored if results is not None)
+    elif job.route.is_pointwise:
+        found = (results[OUTCOME.name] for _, results in output.finished())
+    else:
+        # A run through an atlas has no points before its end.
+        found = []
+    for outcome in found:
         codes.update(dict(zip(*(part.tolist() for part in np.unique(outcome, return_counts=True)), strict=True)))
     return codes
 
 
-def _outcomes(output: OutputState) -> Iterator[np.ndarray]:
-    """Outcomes of all finished points."""
-    if output.state == "complete":
-        yield output.outcomes
-    elif output.state == "partial":
-        seen, written = set[int](), set[int]()
-        for shard, _, results in output.sink.shards(output.job):
-            written.add(shard)
-            yield results[OUTCOME.name]
-        for part in output.parts.read():
-            if output.job.route.counts(part) and not (written and block_of(part) in written):
-                # An interrupt during writing may leave a chunk in two parts.
-                yield from (results[OUTCOME.name] for number, results in part if number not in seen)
-                seen.update(part.chunks.tolist())
-        for _, results in output.reused_before().blocks([OUTCOME.name]):
-            yield results[OUTCOME.name]
+def open_result(path: str | Path) -> xr.Dataset:
+    """The result at ``path``, loaded into memory.
+
+    If only unfinished work in ``FILE.nc.parts/`` exists, missing points have the outcome ``pending`` and no value; the
+    attribute ``points_done`` counts the others. A running computation is not disturbed.
+
+    Raises :class:`InputError` if there is neither, if the result is damaged, or if the work belongs to other code.
+
+    >>> import drivetrain_jax as dt
+    >>> dt.open_result("missing.nc")
+    Traceback (most recent call last):
+    drivetrain_jax._errors.InputError: file = 'missing.nc': does not exist; give a result written by `drivetrain run`
+    """
+    path = Path(path).expanduser()
+    if path.exists() or not PartsFolder(path).holds_work():
+        checksums.refuse_damaged(path)
+        return consolidate.open_result(path)
+    job = resolve(restore_scene(str(PartsFolder(path).plan().get("scene", ""))))
+    output = Output(path, job)
+    if output.state != "partial":
+        raise InputError(f"file = {str(path)!r}: holds {output.obstacle}; allowed is to run its scene again")
+    if not job.route.is_pointwise:
+        raise InputError(
+            f"file = {str(path)!r}: an atlas that is not finished; allowed is to wait for it or to resume it"
+        )
+    buffer, count = ResultBuffer(job.scene, job.grid, blank=PENDING), 0
+    for points, results in output.finished():
+        buffer.fill(points, results)
+        count += results[OUTCOME.name].size
+    found = labelled(job.scene, buffer.lay_out(), {"digest": job.digest, "points_done": count})
+    title = f"{job.scene.title} (unfinished: {count} of {job.total} points)"
+    return with_pending(found).with_attrs(title=title).to_dataset()

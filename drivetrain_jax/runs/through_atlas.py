@@ -14,10 +14,10 @@ from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.atlas import StabilityAtlas, prepare_judging
 from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.atlas_choice import Ranges
-from drivetrain_jax.runs.growing import ReusedPoints
 from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.reuse import ReusedPoints
 from drivetrain_jax.runs.rounds import build_atlas, fixed_of
-from drivetrain_jax.runs.routes import PointsRoute
+from drivetrain_jax.runs.routes import Route
 from drivetrain_jax.runs.work import Progress, Work
 
 # Cells evaluated at a time; determines memory and the interval of progress reports.
@@ -29,10 +29,11 @@ _LARGE = 1 << 19
 Results = Mapping[str, np.ndarray]
 
 
-class ThroughAtlas(PointsRoute):
+class ThroughAtlas(Route):
     """Builds an atlas over ``ranges`` and evaluates it; points that it does not cover are solved."""
 
     name = "an atlas"
+    is_pointwise = False
 
     def __init__(self, ranges: Ranges, max_solves: int | None) -> None:
         self._ranges, self._max_solves = ranges, max_solves
@@ -68,7 +69,7 @@ def _lay_out(job: Job, buffer: ResultBuffer) -> None:
     The thread that fills memory must also allocate it, to reuse memory that earlier results have freed.
     """
     if job.grid.size >= _LARGE and buffer.on_disk and not any(variable.dims for variable in buffer.variables):
-        buffer.lay_out(blank=False)
+        buffer.lay_out()
 
 
 def evaluate(
@@ -99,7 +100,7 @@ def evaluate(
             work.report(progress)
     rest = np.concatenate([np.empty(0, int), *uncovered])
     if rest.size and solve:
-        work.do(job.only(rest), buffer, progress, first)
+        work.do(job, buffer, progress, first, np.sort(rest))
     return rest.size
 
 

@@ -1,9 +1,9 @@
-"""Find the chunks of a run among the parts of an earlier one, or compute and keep them."""
+"""Find the blocks of a run among those of an earlier one, or compute and keep them."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Protocol
@@ -11,25 +11,19 @@ from typing import Protocol
 import numpy as np
 
 from drivetrain_jax._errors import RetryableError
-from drivetrain_jax._wording import counted
-from drivetrain_jax.analysis import OUTCOME
-from drivetrain_jax.runs.assemble import failures, inaccurate
-from drivetrain_jax.runs.executor import Executor
-from drivetrain_jax.runs.job import Job
-from drivetrain_jax.runs.plan import Chunk
-from drivetrain_jax.store.chunks import Part, PartsFolder
-
-# Shortest and longest time in s between two parts, and the largest share of time for writing.
-_SHORTEST, _LONGEST, _WRITE_SHARE = 0.25, 2.0, 0.01
-# Most bytes of results that wait to be written.
-_MOST_WAITING = 1 << 25
+from drivetrain_jax._quantities import FIRST_FAILURE
+from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.runs.executors import Executor
+from drivetrain_jax.runs.job import Block, Job, Results
+from drivetrain_jax.runs.stores import BlockStore
 
 
 @dataclass
 class Progress:
-    """Progress of a run: counts of results of this ``kind``, and costs in units of the plan; ``note`` is a remark.
+    """Progress of a run: counts of results of this ``kind``; ``note`` is a remark.
 
-    ``failed`` points have no value, ``inaccurate`` ones a value whose error exceeds the target.
+    ``failed`` points have no value, ``inaccurate`` ones a value whose error exceeds the target. ``cost`` of ``total_cost``
+    points are computed, those of unfinished blocks included.
     """
 
     total: int
@@ -47,8 +41,8 @@ class Progress:
 
     def count(self, outcome: np.ndarray) -> None:
         """Count the failed and the inaccurate points among these outcomes."""
-        self.failed += failures(outcome)
-        self.inaccurate += inaccurate(outcome)
+        self.failed += int(np.count_nonzero(outcome >= FIRST_FAILURE))
+        self.inaccurate += int(np.count_nonzero(outcome == Outcome.TOLERANCE_NOT_MET))
 
     @property
     def exceptions(self) -> str:
@@ -66,180 +60,109 @@ class Receiver(Protocol):
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
         """Write the results of ``points``."""
 
-    def lose(self, points: np.ndarray) -> None:
-        """Mark these points as lost: their worker crashed three times."""
-
 
 class Work:
-    """Runs chunks on the executor and reports progress.
+    """Runs blocks on the executor and reports progress. Leaving the context ends the workers.
 
-    With ``parts`` (open) it stores finished chunks there and reuses stored ones. Leaving the context ends the workers. After
-    an exception it also writes the chunks in memory; otherwise the result contains them.
+    With a ``store`` finished blocks are kept there, and blocks that it has are not computed again.
     """
 
-    def __init__(self, executor: Executor, report: Report | None = None, parts: PartsFolder | None = None) -> None:
-        self.executor, self.report, self.parts = executor, report, parts
-        self._seconds, self._begin = 0.0, time.monotonic()
-        self._counted = False
-        self._writer = _PartWriter(parts)
+    def __init__(self, executor: Executor, report: Report | None = None, store: BlockStore | None = None) -> None:
+        self.executor, self.report, self.store = executor, report, store
+        self._begin = time.monotonic()
 
     @property
     def elapsed(self) -> float:
-        """Computing time in s, including the time that reused parts took."""
-        return round(self._seconds + time.monotonic() - self._begin, 3)
+        """Time since the start in s."""
+        return round(time.monotonic() - self._begin, 3)
 
     def __enter__(self) -> Work:
         return self
 
-    def __exit__(self, failure: type[BaseException] | None, *_: object) -> None:
-        try:
-            if failure:
-                self._writer.write()
-        finally:
-            self.executor.close()
+    def __exit__(self, *_: object) -> None:
+        self.executor.close()
 
-    def do(self, job: Job, receiver: Receiver, progress: Progress, first: int = 0) -> None:
-        """Compute or reuse all chunks of ``job`` into ``receiver``; stored chunk numbers start at ``first``.
+    def do(
+        self,
+        job: Job,
+        receiver: Receiver | None,
+        progress: Progress,
+        first: int = 0,
+        points: np.ndarray | None = None,
+    ) -> None:
+        """Compute or reuse all blocks of ``job``, or of some of its ``points``, and hand their results to ``receiver``.
 
-        Lost chunks are not stored, so a resumed run computes them again.
+        Without a receiver they are only stored. Numbers in the store start at ``first``.
         """
-        progress.computed += job.unsolvable
-        progress.failed += job.unsolvable
-        if self.parts is None:
-            missing = np.arange(len(job.plan.costs))
-        else:
-            missing = self._reuse(job, self.parts, receiver, progress, first)
-        batch, before = _Batch(receiver, self._writer, first), progress.computed
-        try:
-            self._compute(job, missing, batch, progress)
-            batch.flush()
-        finally:
-            batch.keep()
-            # An interrupt may come between storing a chunk and counting it: count what is stored or lost.
-            progress.computed = before + (batch.kept + batch.lost) * job.grid.path_length
-
-    def _reuse(self, job: Job, parts: PartsFolder, receiver: Receiver, progress: Progress, first: int) -> np.ndarray:
-        """Copy the stored chunks; returns the numbers of the missing ones."""
-        missing = np.ones(len(job.plan.costs), bool)
-        for part in parts.read(repair=True):
-            self._seconds += 0.0 if self._counted else part.seconds
-            for number, results in part:
-                # An interrupt during writing may leave a chunk in two parts.
-                if not (0 <= number - first < missing.size and missing[number - first]):
-                    continue
-                missing[number - first] = False
-                points = job.plan.chunk(number - first).points
-                receiver.fill(points, results)
-                progress.reused += points.size * job.grid.path_length
-                progress.count(results[OUTCOME.name])
-        self._counted = True
-        return np.flatnonzero(missing)
-
-    def _compute(self, job: Job, numbers: np.ndarray, batch: _Batch, progress: Progress) -> None:
-        costs = job.plan.costs
-        progress.cost, progress.total_cost = 0.0, float(costs[numbers].sum())
+        done = set[int]()
+        length, left = job.grid.path_length, job.grid.size if points is None else len(points)
+        for block, results in self._stored(job, first, points, done):
+            done.add(block.number)
+            left -= len(results[OUTCOME.name])
+            if receiver is not None:
+                receiver.fill(job.points(block), results)
+            progress.reused += results[OUTCOME.name].size
+            progress.count(results[OUTCOME.name])
+        progress.cost, progress.total_cost, computed = 0.0, float(left * length), 0
         self._report(progress)
-        missing = len(numbers)
-        if self.executor.in_process:
-            job.prepare(job.plan.kernels(numbers))
-        # Closed on exit: after an interrupt no further chunk starts.
-        with closing(self.executor.run(job, job.ordered(numbers))) as finished:
-            for chunk, results in finished:
-                missing -= 1
-                count = chunk.points.size * job.grid.path_length
+
+        def tick(count: int) -> None:
+            progress.cost += count * length
+            self._report(progress)
+
+        missing = (block for block in job.blocks(points) if block.number not in done)
+        try:
+            # Closed on exit: after an interrupt nothing further starts.
+            with closing(self.executor.run(job, missing, self.store, first, tick)) as finished:
+                for block, results in finished:
+                    results = self._received(job, block, results, first, receiver)
+                    done.add(block.number)
+                    outcome = results[OUTCOME.name]
+                    progress.count(outcome)
+                    progress.computed += outcome.size
+                    computed += outcome.size
+                    progress.cost = max(progress.cost, computed)
+                    self._report(progress)
+            if computed < progress.total_cost:
+                raise RetryableError("some blocks returned no result")
+        except KeyboardInterrupt:
+            # It may come between storing a block and counting it.
+            for _, results in self._stored(job, first, points, done):
+                progress.computed += results[OUTCOME.name].size
+                progress.count(results[OUTCOME.name])
+            raise
+
+    def _received(
+        self, job: Job, block: Block, results: Results | None, first: int, receiver: Receiver | None
+    ) -> Results:
+        """The results of a computed block, handed to ``receiver``; those of a lost one have no values."""
+        if results is None:
+            results = job.joined(block, (), ())
+            results[OUTCOME.name][...] = Outcome.LOST
+            if self.store is not None:
+                self.store.write(first + block.number, results)
+        if receiver is not None:
+            if len(results) == 1 and self.store is not None:
+                # A worker has stored the block.
+                results = self.store.read(first + block.number)
                 if results is None:
-                    batch.lose(chunk)
-                    progress.failed += count
-                else:
-                    batch.add(chunk, results)
-                    progress.count(results[OUTCOME.name])
-                progress.computed += count
-                progress.cost += float(costs[chunk.number])
-                self._report(progress)
-        if missing:
-            raise RetryableError(f"{counted(missing, 'chunk', 'chunks')} returned no result")
+                    where = f"every worker must see the folder {self.store.place!r}"
+                    raise RetryableError(f"block {block.number} is missing after a worker has stored it; {where}")
+            receiver.fill(job.points(block), results)
+        return results
+
+    def _stored(
+        self, job: Job, first: int, points: np.ndarray | None, without: Container[int]
+    ) -> Iterator[tuple[Block, Results]]:
+        """Yield the intact stored blocks ``without`` these numbers."""
+        stored = set(self.store.numbers()) if self.store is not None else set()
+        for block in job.blocks(points) if stored else ():
+            if self.store is None or first + block.number not in stored or block.number in without:
+                continue
+            results = self.store.read(first + block.number)
+            if results is not None and len(results[OUTCOME.name]) == len(job.points(block)):
+                yield block, results
 
     def _report(self, progress: Progress) -> None:
         if self.report:
             self.report(progress)
-
-
-class _PartWriter:
-    """Writes finished chunks in a part every quarter of a second, or less often on a slow disk.
-
-    Without ``parts`` it writes nothing, and only reports when a part is due.
-    """
-
-    def __init__(self, parts: PartsFolder | None) -> None:
-        self._parts = parts
-        self._waiting: list[Part] = []
-        self._added = self._written = time.monotonic()
-        self._interval = _SHORTEST
-
-    def due(self) -> bool:
-        """True if a part is due."""
-        return time.monotonic() - self._written >= self._interval
-
-    def add(self, numbers: list[int], sizes: list[int], results: Mapping[str, np.ndarray]) -> None:
-        """Queue these chunks, and write if a part is due."""
-        now = time.monotonic()
-        if self._parts:
-            self._waiting.append(Part(numbers, sizes, results, now - self._added))
-        self._added = now
-        if self.due() or sum(part.nbytes for part in self._waiting) >= _MOST_WAITING:
-            self.write()
-
-    def write(self) -> None:
-        """Write the queued chunks."""
-        begin = time.monotonic()
-        while self._waiting and self._parts:
-            self._parts.write(self._waiting[0])
-            del self._waiting[0]
-        self._written = time.monotonic()
-        self._interval = min(max(_SHORTEST, (self._written - begin) / _WRITE_SHARE), _LONGEST)
-
-
-class _Batch:
-    """Collects finished chunks and enters them together, which costs a third of entering them one by one."""
-
-    def __init__(self, receiver: Receiver, writer: _PartWriter, first: int) -> None:
-        self.receiver, self._writer, self._first = receiver, writer, first
-        self._waiting: list[tuple[Chunk, Mapping[str, np.ndarray]]] = []
-        self._bytes = 0
-        self._begun = False
-        self.kept = self.lost = 0
-
-    def add(self, chunk: Chunk, results: Mapping[str, np.ndarray]) -> None:
-        self._waiting.append((chunk, results))
-        self._bytes += sum(values.nbytes for values in results.values())
-        if not self._begun:
-            # The first results allocate the whole output, so a full disk is reported before more is computed.
-            self._begun = True
-            self.receiver.fill(chunk.points, results)
-        if self._bytes >= _MOST_WAITING or self._writer.due():
-            self.flush()
-
-    def lose(self, chunk: Chunk) -> None:
-        """Mark the points of a chunk as lost."""
-        self.receiver.lose(chunk.points)
-        self.lost += chunk.points.size
-
-    def flush(self) -> None:
-        """Store and enter the queued chunks."""
-        chunks, results = self.keep()
-        if chunks:
-            self.receiver.fill(np.concatenate([chunk.points for chunk in chunks]), results)
-
-    def keep(self) -> tuple[list[Chunk], dict[str, np.ndarray]]:
-        """Store the queued chunks; returns the chunks and their concatenated results."""
-        chunks = [chunk for chunk, _ in self._waiting]
-        if not chunks:
-            return [], {}
-        all_results = [results for _, results in self._waiting]
-        joined = {name: np.concatenate([results[name] for results in all_results]) for name in all_results[0]}
-        sizes = [chunk.points.size for chunk in chunks]
-        self._writer.add([self._first + chunk.number for chunk in chunks], sizes, joined)
-        self._waiting.clear()
-        self._bytes = 0
-        self.kept += sum(sizes)
-        return chunks, joined

@@ -18,7 +18,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._machine import usable_cores
-from drivetrain_jax.store import gate
+from drivetrain_jax.store.reading import opened
 
 ATTRIBUTE = "checksums"
 # The name of the root group stands for the attributes of the file.
@@ -63,7 +63,7 @@ def damaged(path: Path) -> list[str] | None:
 
     Raises :class:`InputError` if the file cannot be read.
     """
-    with gate.opened(path) as file:
+    with opened(path) as file:
         stored = file.attrs.get(ATTRIBUTE)
         if stored is None:
             return None
@@ -84,7 +84,7 @@ def refuse_damaged(path: Path, *, rewritten: bool = False) -> None:
 
 def _rewritten(path: Path) -> bool:
     """True if another program, such as h5netcdf, has written the file."""
-    with gate.opened(path) as file:
+    with opened(path) as file:
         maker = np.asarray(file.attrs.get("_NCProperties", b"")).tobytes()
     return bool(maker) and not maker.startswith(b"version=2,h5py=")
 

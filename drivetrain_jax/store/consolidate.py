@@ -13,8 +13,9 @@ import h5py
 import numpy as np
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.store import checksums, gate, netcdf
+from drivetrain_jax.store import checksums, netcdf
 from drivetrain_jax.store.files import flush, move_into_place, naming
+from drivetrain_jax.store.reading import BROKEN, opened, unreadable
 from drivetrain_jax.store.schema import GROUP, Labelled
 
 if TYPE_CHECKING:
@@ -59,13 +60,12 @@ class ResultFile:
         with naming(self._temporary), ThreadPoolExecutor(1) as aside:
             # Start writing the mapped pages now; computing the checksums reads them meanwhile.
             written = aside.submit(flush, self._temporary)
-            with h5py.File(self._temporary, "r+") as file:
+            with h5py.File(self._temporary, "r+", libver=netcdf.LIBVER) as file:
                 for name, value in attrs.items():
                     file.attrs.modify(name, value)
                 checksums.seal(file)
             written.result()
         move_into_place(self._temporary, path)
-        gate.trust(path)
 
 
 def write_result(result: Labelled, path: Path, temporary: Path, preface: bytes = b"") -> None:
@@ -86,7 +86,7 @@ def _write_frame(template: Labelled, path: Path, preface: bytes) -> Mapping[str,
     path.unlink(missing_ok=True)
     path.write_bytes(head)
     _reserve(path, len(head) + sum(entry.values.nbytes + _LABELS for entry in template.data.values()))
-    with h5py.File(path, "r+") as file:
+    with h5py.File(path, "r+", libver=netcdf.LIBVER) as file:
         places = netcdf.add_data(file, template)
         checksums.reserve(file)
     _reserve(path, path.stat().st_size)
@@ -116,7 +116,7 @@ def read_attribute(path: Path, name: str) -> str | None:
 
     Raises :class:`InputError` if the file is not readable.
     """
-    with gate.opened(path) as file:
+    with opened(path) as file:
         # Older files have no group of details.
         holds = file[GROUP] if name not in file.attrs and GROUP in file else file
         value = holds.attrs.get(name)
@@ -125,7 +125,7 @@ def read_attribute(path: Path, name: str) -> str | None:
 
 def read_variable(path: Path, name: str) -> np.ndarray:
     """One variable of the result at ``path``, without loading the others; ``InputError`` if it cannot be read."""
-    with gate.opened(path) as file:
+    with opened(path) as file:
         return _variable(file, name)[()]
 
 
@@ -138,7 +138,7 @@ def _variable(file: h5py.File, name: str) -> h5py.Dataset:
 
 def map_variable(path: Path, name: str) -> np.ndarray:
     """Like :func:`read_variable`, but as a memory map where the storage of the variable allows that."""
-    with gate.opened(path) as file:
+    with opened(path) as file:
         variable = _variable(file, name)
         # The words of a file are references, which only HDF5 can follow.
         plain = variable.chunks is None and not variable.dtype.hasobject
@@ -152,7 +152,7 @@ def read_plain(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
     Raises :class:`InputError` if the file is not readable.
     """
-    with gate.opened(path) as file:
+    with opened(path) as file:
         variables = {name: each for name, each in file.items() if isinstance(each, h5py.Dataset)}
         strings = {name for name, each in variables.items() if h5py.check_string_dtype(each.dtype)}
         arrays = {n: np.asarray((each.asstr() if n in strings else each)[()]) for n, each in variables.items()}
@@ -177,8 +177,8 @@ def open_result(path: Path) -> xr.Dataset:
     try:
         with xr.open_dataset(path, engine="h5netcdf") as dataset:
             result = dataset.load()
-    except (AttributeError, *gate.BROKEN):
-        raise gate.unreadable(path, "") from None
+    except (AttributeError, *BROKEN):
+        raise unreadable(path) from None
     if "analysis" not in result.attrs:
         raise InputError(f"file = {str(path)!r}: not a result of drivetrain_jax; give one written by `drivetrain run`")
     return result

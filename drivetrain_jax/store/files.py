@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import errno
-import math
 import os
-import re
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,48 +12,20 @@ from pathlib import Path
 ATLAS_PREFACE = b"An atlas of drivetrain_jax, HDF5 from byte 512 on.\n"
 
 
-# The error number inside a message of HDF5, which raises RuntimeError, KeyError or ValueError for a failed system call.
-_ERRNO = re.compile(r"\berrno = (\d+)")
-
-
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Raise an I/O error inside the context as ``OSError`` with its reason and ``path``, those inside HDF5 too."""
+    """Raise an I/O error inside the context as ``OSError`` with ``path``, those of HDF5, which have other types, too."""
     try:
         yield
-    except (OSError, KeyError, RuntimeError, ValueError, TypeError) as error:
-        number = _errno(error)
-        if number is None:
-            raise
-        raise OSError(number, os.strerror(number), str(path)) from error
-
-
-def _errno(error: BaseException | None) -> int | None:
-    """The number of the system call that failed in ``error``, or before it."""
-    while error is not None:
-        if found := _ERRNO.search(str(error)):
-            return int(found.group(1))
+    except (OSError, KeyError, RuntimeError, ValueError) as error:
         if isinstance(error, OSError) and error.errno:
-            return error.errno
-        error = error.__context__
-    return None
+            raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
+        raise OSError(f"{path}: {error}") from error
 
 
 def behind_link(path: Path) -> Path:
     """``path``, or the target of a link: renaming would replace the link."""
     return Path(os.path.realpath(path)) if path.is_symlink() else path
-
-
-def read_regular(path: Path, most: float = math.inf) -> bytes:
-    """The content of the regular file ``path``; ``OSError`` for a pipe, a device, or more than ``most`` bytes."""
-    # Opening a pipe without this flag waits for a writer.
-    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0))) as file:
-        found = os.fstat(file.fileno())
-        if not stat.S_ISREG(found.st_mode):
-            raise OSError(errno.EINVAL, "not a regular file", str(path))
-        if found.st_size > most:
-            raise OSError(errno.EFBIG, f"larger than {most / 2**20:.0f} MB", str(path))
-        return file.read()
 
 
 def write_atomic(path: Path, data: bytes | memoryview, temporary: Path) -> None:

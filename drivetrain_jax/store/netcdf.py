@@ -16,6 +16,8 @@ from drivetrain_jax.store.schema import DETAILS, GROUP, Entry, Labelled
 
 _MADE_BY = f"version=2,h5py={h5py.__version__},hdf5={h5py.version.hdf5_version}"
 _NOT_A_VARIABLE = "This is a netCDF dimension but not a netCDF variable."
+# The oldest format of HDF5 (1.10) whose metadata have checksums.
+LIBVER = ("v110", "v110")
 # Names of the complex types that netCDF readers know.
 _COMPLEX = {"complex64": "_PFNC_FLOAT_COMPLEX_TYPE", "complex128": "_PFNC_DOUBLE_COMPLEX_TYPE"}
 
@@ -23,7 +25,7 @@ _COMPLEX = {"complex64": "_PFNC_FLOAT_COMPLEX_TYPE", "complex128": "_PFNC_DOUBLE
 def head(result: Labelled) -> bytes:
     """The bytes of a file with all of ``result`` except its data: attributes, dimensions and coordinates."""
     aside = _aside(result)
-    with h5py.File("head", "w", driver="core", backing_store=False, track_order=True) as file:
+    with h5py.File("head", "w", driver="core", backing_store=False, track_order=True, libver=LIBVER) as file:
         file.attrs["_NCProperties"] = np.bytes_(_MADE_BY)
         details = {name: value for name, value in result.attrs.items() if name in DETAILS}
         shown = {name: value for name, value in result.attrs.items() if name not in DETAILS}

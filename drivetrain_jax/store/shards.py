@@ -1,4 +1,4 @@
-"""Boxes of a sweep: the blocks in which points are planned, and the shards of a Zarr store."""
+"""Boxes of a sweep: its blocks, which are the shards of a Zarr store."""
 
 from __future__ import annotations
 
@@ -6,9 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-
-# Upper limits of the points of a shard, and of the bytes of its results.
-MOST_POINTS, _MOST_BYTES = 1 << 18, 1 << 28
 
 Place = tuple[slice, ...]
 
@@ -24,10 +21,9 @@ class Shards:
     lengths: tuple[int, ...]
 
     @classmethod
-    def of(cls, shape: tuple[int, ...], path: int | None, row_bytes: int) -> Shards:
-        """Shards of a sweep with its path along axis number ``path``, and ``row_bytes`` of results at a point."""
-        whole = 1 if path is None else shape[path]
-        room, lengths = max(1, min(MOST_POINTS, _MOST_BYTES // max(row_bytes, 1)) // whole), []
+    def of(cls, shape: tuple[int, ...], path: int | None, most: int) -> Shards:
+        """Shards of up to ``most`` points, or of lines along axis number ``path``."""
+        room, lengths = most, []
         for axis in reversed(range(len(shape))):
             size = shape[axis]
             # Parts of equal length, so that no shard has few points.

@@ -1,23 +1,24 @@
-"""Commands of toy scenes that die, or fail, at one system call after the other: prints a JSON object for every injection.
+"""``make faults``: commands of toy scenes that die, or fail, at one system call after the other; writes docs/reliability.md.
 
-Run under ``calls.c``: ``crashes.py FOLDER SEED SHARE SHARES EVERY [KIND ...]`` injects one of ``EVERY`` faults of its share.
-The commands run in forks of this process, which imports jax once and computes nothing.
+``crashes.py [--every N] [--seed N] [KIND ...]`` injects one of N faults, under ``calls.c``, which it compiles. The commands
+run in forks of one process, which imports jax once and computes nothing.
 """
 
 from __future__ import annotations
 
+import argparse
 import ctypes
 import errno
 import gc
 import json
 import os
 import random
-import resource
 import select
 import shutil
 import signal
+import subprocess
 import sys
-import time
+import tempfile
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,15 +27,16 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "runs"))
 
+import h5py
+import numpy as np
 import toy
 import xarray
-from harness import arrays
-from io_errors import scene
+from page import write
 
 from drivetrain_jax.cli import main
-from drivetrain_jax.runs import toml, work
+from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.status import status
-from drivetrain_jax.store import shards
+from drivetrain_jax.store.provenance import now
 
 PATIENCE = 60.0
 # Allowed exit codes of a command whose system call fails.
@@ -45,9 +47,15 @@ ATLAS = {
     "axes": {"beta": {"start": 0.1, "stop": 0.5}},
     "fixed": {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "Omega": 1.3, "gamma": 100.0},
 }
-# Both solvers, two shards.
-SCENES = {"small": scene(14, 3), "large": scene(20, 3), "other": scene(14, 4)}
-SCENES = {name: content | {"outputs": ["value"]} for name, content in SCENES.items()} | {"atlas": ATLAS}
+
+
+def scene(count: int, n: int) -> dict:
+    """A chart of 3 x ``count`` points for both solvers, in several blocks."""
+    axes = {"b": {"values": [1.0, 3.0, 2.0]}, "a": {"values": [k / 8 for k in range(count)]}}
+    return {"system": "toy", "analysis": "toy", "outputs": ["value"], "axes": axes, "fixed": {"n": n}}
+
+
+SCENES = {"small": scene(14, 3), "large": scene(20, 3), "other": scene(14, 4), "atlas": ATLAS}
 STORE = ["--store", "zarr"]
 # Modules that the commands import late, and that start no thread.
 MODULES = ("matplotlib.pyplot", "xarray", "zarr", "h5netcdf", "diffrax", "drivetrain_jax.systems.cardan")
@@ -172,7 +180,11 @@ class Workshop:
         """The bits of the result in ``folder``; empty without a result."""
         path = folder / self.out
         if path.is_file():
-            return {name: found[:4] for name, found in arrays(path).items()}
+            with h5py.File(path) as file:
+                variables = {name: each for name, each in file.items() if isinstance(each, h5py.Dataset)}
+                return {
+                    n: (str(x.dtype), x.shape, np.asarray(x[()]).astype(str).tolist()) for n, x in variables.items()
+                }
         # Files of the store except checksums, which cover times.
         files = [
             file for file in path.rglob("*") if file.parent.name != path.name and "c" in file.parts and file.is_file()
@@ -240,7 +252,7 @@ def judged(ended: Ended, number: int, lost: bool) -> list[str]:
 
 
 def prepare(folder: Path) -> None:
-    """Scenes, toys, intervals without pause, and modules of all forks: none of them starts a thread."""
+    """Scenes, toys, small blocks, and modules of all forks: none of them starts a thread."""
     for module in MODULES:
         import_module(module)
     # A data set imports the kinds of arrays that it may hold.
@@ -249,37 +261,71 @@ def prepare(folder: Path) -> None:
         (folder / f"{name}.toml").write_text(toml.write(content))
     os.environ["DRIVETRAIN_JAX_CACHE"] = str(folder.parent / "cache")
     toy.names()
-    work._SHORTEST = work._LONGEST = 0.0
-    shards.MOST_POINTS = 28
+    toy.small_blocks()
     # Collections in a fork would copy the pages of all these objects.
     gc.freeze()
 
 
-def places(calls: int, share: int, shares: int, every: int, rng: random.Random) -> list[tuple[str, int]]:
+def places(calls: int, every: int, rng: random.Random) -> list[tuple[str, int]]:
     """Faults and numbers of calls: kills and power cuts at one of ``every`` calls, the others at a quarter of those."""
     found = []
     for name in FAULTS:
-        own = range(1 + share, calls + 1, shares)
         rate = every if name in ("kill", "power cut") else 4 * every
-        found += [(name, at) for at in rng.sample(own, -(-len(own) // rate))]
+        found += [(name, at) for at in rng.sample(range(1, calls + 1), -(-calls // rate))]
     return found
 
 
-def crashes(folder: Path, seed: int, share: int, shares: int, every: int, kinds: list[str]) -> None:
-    """All injections of this share."""
-    rng = random.Random(f"{seed} {share}")
+def crashes(folder: Path, seed: int, every: int, kinds: Sequence[str]) -> list[dict]:
+    """The records of all injections; problems are reported at once."""
+    rng, records = random.Random(seed), []
     folder.mkdir(parents=True)
     prepare(folder)
     for kind in kinds or KINDS:
         shop = Workshop(folder / kind.replace(" ", "-"), kind)
-        for name, at in places(shop.calls, share, shares, every, rng):
-            begin = time.monotonic()
-            record = inject(shop, name, at, rng)
-            record |= {"kind": kind, "fault": name, "at": at, "calls": shop.calls}
-            record |= {"memory": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6}
-            print(json.dumps(record | {"seconds": round(time.monotonic() - begin, 2)}), flush=True)
+        for name, at in places(shop.calls, every, rng):
+            record = inject(shop, name, at, rng) | {"kind": kind, "fault": name, "at": at}
+            records.append(record)
+            if record["problem"] or record["wrong"]:
+                sys.stderr.write(json.dumps(record) + "\n")
+        sys.stderr.write(f"{kind}: {sum(record['kind'] == kind for record in records)} injections\n")
+    return records
+
+
+def table(records: list[dict]) -> str:
+    """The table of docs/reliability.md."""
+    lines = [f"| command | {' | '.join(FAULTS)} | killed twice | points lost | wrong | other problems |"]
+    lines.append("| --- " * (len(FAULTS) + 5) + "|")
+    for kind in [*dict.fromkeys(record["kind"] for record in records), "**all**"]:
+        own = [record for record in records if kind in (record["kind"], "**all**")]
+        counts = [sum(record["fault"] == name for record in own) for name in FAULTS]
+        sums = [
+            sum(bool(r["problem"]) if key == "problem" else r[key] for r in own)
+            for key in ("twice", "lost", "wrong", "problem")
+        ]
+        lines.append(f"| {kind} | {' | '.join(map(str, counts + sums))} |")
+    return f"{len(records)} faults, {now()[:10]}.\n\n" + "\n".join(lines)
+
+
+def main_of_forks() -> int:
+    """Inject faults, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("kinds", nargs="*")
+    parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--seed", type=int, default=random.randrange(1 << 20))
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as folder:
+        if "FAULT_LIBRARY" not in os.environ:
+            library = str(Path(folder) / "calls.so")
+            source = str(Path(__file__).with_name("calls.c"))
+            subprocess.run(["cc", "-shared", "-fPIC", "-O1", "-o", library, source, "-ldl"], check=True)
+            environment = os.environ | {"LD_PRELOAD": library, "FAULT_LIBRARY": library}
+            return subprocess.run([sys.executable, *sys.argv], env=environment, check=False).returncode
+        records = crashes(Path(folder) / "faults", options.seed, options.every, options.kinds)
+    if not options.kinds and options.every == 1:
+        write("faults", table(records))
+    sys.stdout.write(table(records) + "\n")
+    return any(record["problem"] or record["wrong"] for record in records)
 
 
 if __name__ == "__main__":
-    where, *numbers = sys.argv[1:6]
-    crashes(Path(where), *map(int, numbers), sys.argv[6:])
+    sys.exit(main_of_forks())

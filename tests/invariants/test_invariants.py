@@ -12,8 +12,8 @@ from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.analysis import Outcome, analysis_names, get_analysis
 from drivetrain_jax.invariants import check, declared
 from drivetrain_jax.invariants.verify import verify
-from drivetrain_jax.store.chunks import Part, PartsFolder
 from drivetrain_jax.store.consolidate import write_result
+from drivetrain_jax.store.parts import PartsFolder
 from drivetrain_jax.systems import get_system, system_names
 from tests.labels import labelled
 
@@ -200,10 +200,12 @@ def test_verify_unfinished_work(tmp_path):
     folder.open()
     folder.start({"digest": "abc"})
     for number in (0, 1):
-        folder.write(Part([number], [2], {"outcome": np.zeros(2, np.int8)}, 0.1))
+        folder.blocks.write(number, {"outcome": np.zeros(2, np.int8)})
     folder.close()
     report = verify(tmp_path / "r.nc")
-    assert (report.problem, report.complete) == ("", False) and report.lines == ("unfinished: 2 of 2 parts are intact",)
-    part = next(folder.path.glob("0*.h5"))
+    assert (report.problem, report.complete) == ("", False) and report.lines == (
+        "unfinished: 2 of 2 blocks are intact",
+    )
+    part = next(folder.path.glob("0*.npz"))
     part.write_bytes(part.read_bytes()[:-1])
-    assert verify(tmp_path / "r.nc").lines[0] == "unfinished: 1 of 2 parts are intact"
+    assert verify(tmp_path / "r.nc").lines[0] == "unfinished: 1 of 2 blocks are intact"

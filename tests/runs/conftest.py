@@ -19,6 +19,14 @@ def toys(monkeypatch):
 
 
 @pytest.fixture
+def small_blocks(monkeypatch):
+    """Let even small scenes have several blocks."""
+    import toy
+
+    toy.small_blocks(monkeypatch.setattr)
+
+
+@pytest.fixture
 def grid_scene():
     """A scene that uses both solvers, with some failing points and a short last chunk."""
     return {

@@ -190,6 +190,7 @@ def interrupted_run(scene, out, reports):
         run_to_file(scene, out, report=stop_after(reports))
 
 
+@pytest.mark.usefixtures("small_blocks")
 @pytest.mark.parametrize(
     ("scene", "chunks"),
     full_after(1, [(ATLAS, 1), (AT_ONE_SPEED, 1), (AT_ONE_SPEED, 3), (AT_ONE_SPEED, 6)], several=True),
@@ -211,7 +212,7 @@ def test_an_interrupted_chart_is_resumed_with_the_same_bits(tmp_path, monkeypatc
     out, scene = tmp_path / "a.nc", floquet("atlas")
     interrupted_run(scene, out, 2)
     # The file may be laid out after the last solve has finished.
-    slowly = lambda _, table: (time.sleep(1.0), table.lay_out(blank=False))  # noqa: E731
+    slowly = lambda _, table: (time.sleep(1.0), table.lay_out())  # noqa: E731
     monkeypatch.setattr(through_atlas, "_lay_out", slowly)
     progress = run_to_file(scene, out)
     assert progress.total == progress.computed == 533 and progress.failed == 0

@@ -22,6 +22,7 @@ from drivetrain_jax.analysis.critical_speeds import frequency_roots as shaft_roo
 from drivetrain_jax.analysis.history import integration as history
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
 from drivetrain_jax.analysis.numerics import singular_values
+from drivetrain_jax.runs.job import Block
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
@@ -99,17 +100,15 @@ def operations(jaxpr: Any) -> int:
 @pytest.mark.parametrize("system", ["cardan", "bicardan", "rattle"])
 def test_operations(system):
     engine = resolve(load_scene(SCENES[system]))
-    solver = engine.solvers[engine.plan.groups[0].index]
+    solver = engine.solvers[engine.plan(Block(0))[0].solver]
     columns = {name: jax.ShapeDtypeStruct((8,), float) for name in engine.grid.columns(np.arange(1))}
     traced = jax.make_jaxpr(lambda c, effort: solver.solve(engine.grid.bind(c), effort))(columns, np.int64(1))
     assert not complaint(f"operations {system}", operations(traced.jaxpr))
 
 
 def test_panels_of_the_chart():
-    plan = resolve(load_scene(SCENES["cardan"])).plan
-    assert not complaint(
-        "predicted panels cardan", int(sum(group.efforts.sum() * group.chunk for group in plan.groups))
-    )
+    chunks = resolve(load_scene(SCENES["cardan"])).plan(Block(0))
+    assert not complaint("predicted panels cardan", sum(chunk.effort * chunk.size for chunk in chunks))
 
 
 @pytest.mark.full

@@ -14,7 +14,7 @@ import drivetrain_jax as dt
 from drivetrain_jax.analysis.numerics import kernels
 from drivetrain_jax.atlas import charts
 from drivetrain_jax.runs import kernel
-from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.job import Block, Job
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.routes import DIRECT
 from drivetrain_jax.runs.scene import load_scene
@@ -144,7 +144,7 @@ def test_scenes_of_few_points_are_compiled_without_optimising(monkeypatch):
         scene = load_scene({"system": "toy", "analysis": "toy", "axes": {"a": {"start": 0, "stop": 1, "num": count}}})
         engine = Job(scene, DIRECT, full_size=full_size)
         engine.solvers = tuple(replace(solver, **change) for solver in engine.solvers)
-        engine.prepare({(0, 16)})
+        engine.prepare(engine.plan(Block(0)))
         assert all(future.result() for future in engine._kernels.values())
         kernel._compiled.cache_clear()
     assert given == [True, False, False, False, False]

@@ -8,11 +8,12 @@ from interrupts import stop_after
 
 import drivetrain_jax as dt
 from drivetrain_jax.cli import main
-from drivetrain_jax.runs import work
-from drivetrain_jax.runs.executor import Threads
-from drivetrain_jax.runs.partial import PENDING
+from drivetrain_jax.runs.assemble import PENDING
+from drivetrain_jax.runs.executors import Threads
 from drivetrain_jax.runs.run import Interrupted, run_to_file
-from drivetrain_jax.store.chunks import PartsFolder
+from drivetrain_jax.store.parts import PartsFolder
+
+pytestmark = pytest.mark.usefixtures("small_blocks")
 
 
 def compare(partial, whole):
@@ -25,14 +26,12 @@ def compare(partial, whole):
     assert "unfinished" in partial.attrs["title"] and partial["outcome"].attrs["flag_meanings"].endswith(" pending")
 
 
-def test_finished_points_have_values_and_others_are_pending(grid_scene, tmp_path, monkeypatch):
-    # Every chunk is written immediately.
-    monkeypatch.setattr(work, "_SHORTEST", 0.0)
+def test_finished_points_have_values_and_others_are_pending(grid_scene, tmp_path):
     path, whole = tmp_path / "r.nc", dt.run(grid_scene)
     seen = []
 
     def look(progress):
-        if progress.computed and not seen and PartsFolder(path).count():
+        if progress.computed and not seen and PartsFolder(path).blocks.numbers():
             seen.append(dt.open_result(path))
 
     run_to_file(grid_scene, path, executor=Threads(1), report=look)

@@ -17,12 +17,11 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition,
 
 import drivetrain_jax as dt
 from drivetrain_jax import InputError
-from drivetrain_jax.runs import work
-from drivetrain_jax.runs.executor import Threads
+from drivetrain_jax.runs.executors import Threads
 from drivetrain_jax.runs.run import Interrupted, run_to_file
 from drivetrain_jax.runs.status import status
-from drivetrain_jax.store import shards, zarr_store
-from drivetrain_jax.store.chunks import PartsFolder
+from drivetrain_jax.store import zarr_store
+from drivetrain_jax.store.parts import PartsFolder
 from tests.sizes import full_after
 
 COUNTS, NUMBERS = (8, 24, 40), (3, 4)
@@ -133,10 +132,10 @@ class ResumeMachine(RuleBasedStateMachine):
     def change(self, number):
         self.number = number
 
-    @precondition(lambda self: any(self.parts.path.glob("*-*.h5")))
+    @precondition(lambda self: any(self.parts.path.glob("*-*.npz")))
     @rule(data=st.data())
     def damage(self, data):
-        part = data.draw(st.sampled_from(sorted(self.parts.path.glob("*-*.h5"))))
+        part = data.draw(st.sampled_from(sorted(self.parts.path.glob("*-*.npz"))))
         content = bytearray(part.read_bytes())
         at = data.draw(st.integers(0, max(len(content) - 1, 0)))
         if data.draw(st.booleans()) and content:
@@ -178,11 +177,9 @@ class StoreMachine(ResumeMachine):
 
 
 @pytest.fixture(autouse=True)
-def intervals(monkeypatch):
+def small_blocks(monkeypatch):
     toy.names(monkeypatch.setattr)
-    monkeypatch.setattr(work, "_SHORTEST", 0.0)
-    monkeypatch.setattr(work, "_LONGEST", 0.0)
-    monkeypatch.setattr(shards, "MOST_POINTS", 28)
+    toy.small_blocks(monkeypatch.setattr)
 
 
 HOW = {"deadline": None, "suppress_health_check": list(HealthCheck), "database": None, "phases": (Phase.generate,)}

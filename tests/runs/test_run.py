@@ -22,13 +22,14 @@ from interrupts import stop_after
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import Dimension, Solver
 from drivetrain_jax.functions import analyse
-from drivetrain_jax.runs import toml, work
-from drivetrain_jax.runs.cluster import Cluster
-from drivetrain_jax.runs.executor import Threads
+from drivetrain_jax.runs import toml
+from drivetrain_jax.runs.executors import Cluster, Threads
 from drivetrain_jax.runs.run import Incomplete, run_to_file
 from drivetrain_jax.runs.status import status
-from drivetrain_jax.store.chunks import PartsFolder
+from drivetrain_jax.store.parts import PartsFolder
 from tests.sizes import full_after
+
+pytestmark = pytest.mark.usefixtures("small_blocks")
 
 
 def expected_value(a, b, n=3, length=(1.0, 2.0, 3.0)):
@@ -348,7 +349,7 @@ def test_a_run_that_ends_between_check_and_lock_is_noticed(grid_scene, tmp_path,
 def test_a_finished_result_in_a_folder_without_write_permission_is_read(grid_scene, tmp_path, monkeypatch):
     path = tmp_path / "r.nc"
     run_to_file(grid_scene, path)
-    monkeypatch.setattr("drivetrain_jax.runs.output_state.os.access", lambda *_: False)
+    monkeypatch.setattr("drivetrain_jax.runs.output.os.access", lambda *_: False)
     assert run_to_file(grid_scene, path).reused == 123 and status(grid_scene, path).state == "complete"
     assert_same(dt.run(grid_scene, path), dt.run(grid_scene))
     for fresh, name in ((True, "r.nc"), (False, "new.nc")):
@@ -370,11 +371,11 @@ def test_a_link_stays_a_link_and_has_the_lock_of_its_file(grid_scene, tmp_path):
     assert link.is_symlink() and os.listdir(tmp_path / "data") == ["r.nc"]
 
 
-def test_corrupted_chunk_is_computed_again(grid_scene, tmp_path):
+def test_a_damaged_block_is_computed_again(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt) as stopped:
         run_to_file(grid_scene, path, executor=Threads(1), report=stop_after(2))
-    for part in Path(f"{path}.parts").glob("*.h5"):
+    for part in Path(f"{path}.parts").glob("*.npz"):
         data = bytearray(part.read_bytes())
         data[len(data) // 2] ^= 1
         part.write_bytes(data)
@@ -383,12 +384,12 @@ def test_corrupted_chunk_is_computed_again(grid_scene, tmp_path):
     assert_same(xr.open_dataset(path, engine="h5netcdf"), dt.run(grid_scene))
 
 
-def test_failing_chunk_leaves_a_resumable_run(tmp_path):
+def test_a_failing_solver_leaves_a_resumable_run(tmp_path):
     scene = {"system": "toy", "analysis": "broken", "axes": {"a": {"values": [1.0, 2.0]}}}
-    with pytest.raises(Incomplete, match=r"chunk 0 \(broken\): RuntimeError: no luck"):
+    with pytest.raises(Incomplete, match=r"broken: RuntimeError: no luck"):
         run_to_file(scene, tmp_path / "r.nc")
     assert status(scene, tmp_path / "r.nc").state == "partial" and not (tmp_path / "r.nc").exists()
-    with pytest.raises(Incomplete, match="chunk 0"):
+    with pytest.raises(Incomplete, match="broken: RuntimeError"):
         dt.run(scene)
 
 
@@ -440,7 +441,7 @@ def test_only_errors_that_may_vanish_offer_the_same_command(grid_scene, tmp_path
         raise error
 
     monkeypatch.setattr("drivetrain_jax.runs.job.kernel_of", lambda *_: kernel)
-    with pytest.raises(Incomplete, match=rf"^chunk \d+ \(\w+\): {type(error).__name__}: ") as stopped:
+    with pytest.raises(Incomplete, match=rf"^\w+: {type(error).__name__}: ") as stopped:
         run_to_file(grid_scene, tmp_path / "r.nc", executor=Threads(1))
     assert str(stopped.value).endswith("; the same command resumes") is passes
 
@@ -473,28 +474,15 @@ def test_fresh_does_not_resume_parts_of_the_present_result(grid_scene, tmp_path,
 
     def fresh_but_for_the_end():
         with monkeypatch.context() as short:
-            short.setattr(work, "_SHORTEST", 0.0)
             short.setattr(PartsFolder, "close", killed)
             with pytest.raises(KeyboardInterrupt):
                 run_to_file(grid_scene, path, fresh=True)
-        assert PartsFolder(path).count()
+        assert PartsFolder(path).blocks.numbers()
 
     fresh_but_for_the_end()
     assert run_to_file(grid_scene, path, fresh=True).computed == 123
     fresh_but_for_the_end()
     assert run_to_file(grid_scene, path).reused == 123 and os.listdir(tmp_path) == ["r.nc"]
-
-
-def test_a_short_run_without_failure_writes_no_parts(grid_scene, tmp_path, monkeypatch):
-    written = []
-    monkeypatch.setattr(PartsFolder, "write", lambda _, part: written.append(part))
-    monkeypatch.setattr(work, "_SHORTEST", 60.0)
-    run_to_file(grid_scene, tmp_path / "r.nc")
-    assert not written
-    monkeypatch.setattr("drivetrain_jax.runs.routes.ResultFile.finish", lambda *_, **__: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        run_to_file(grid_scene, tmp_path / "s.nc")
-    assert sum(part.sizes.sum() for part in written) == dt.run(grid_scene)["outcome"].size
 
 
 def test_result_too_large_for_the_memory_is_refused_at_once(grid_scene, monkeypatch):
@@ -525,14 +513,11 @@ MANY = """
 import resource, sys, threading, toy
 from pathlib import Path
 toy.names()
-from drivetrain_jax.runs import assemble, plan, work
-from drivetrain_jax.store import shards
+from drivetrain_jax.runs import assemble, plan
 from drivetrain_jax.runs.run import run_to_file
 
 # As if the sweep were as many times larger.
-shards.MOST_POINTS, plan._PIECE, assemble._RESIDENT, assemble._ROWS = 1 << 13, 1 << 12, 1 << 20, 1 << 17
-# What waits to be written is not what is looked for.
-work._LONGEST = work._SHORTEST
+plan._SECONDS, plan._MOST_POINTS, plan._PIECE, assemble._RESIDENT = 2, 1 << 13, 1 << 12, 1 << 20
 
 def peak():
     return int(next(l for l in Path("/proc/self/status").read_text().splitlines() if l.startswith("VmRSS")).split()[1])
@@ -579,7 +564,7 @@ def slow_process(tmp_path):
 
 def wait_for_parts(out, count, process):
     deadline = time.monotonic() + 30
-    while len(list(Path(f"{out}.parts").glob("*.h5"))) < count:
+    while len(list(Path(f"{out}.parts").glob("*.npz"))) < count:
         assert process.poll() is None, process.stderr.read()
         assert time.monotonic() < deadline, "no parts appeared"
         time.sleep(0.01)
@@ -614,22 +599,6 @@ def test_signal_stops_promptly_and_loses_nothing(slow_process, sent):
     found = status(SLOW, out)
     assert lines[-1] == f"points: total=400 computed={found.done} reused=0 failed=0" and len(lines) == 2
     assert 0 < found.done < 400 and "Traceback" not in stderr
-
-
-@pytest.mark.full
-def test_repeated_interrupts_lose_nothing(slow_process):
-    """Finished chunks are written after the first interrupt, and further interrupts do not stop this."""
-    start, out = slow_process
-    process = start()
-    wait_for_parts(out, 1, process)
-    time.sleep(0.15)
-    for _ in range(40):
-        process.send_signal(signal.SIGINT)
-        time.sleep(0.0005)
-    _, stderr = process.communicate(timeout=60)
-    found = status(SLOW, out)
-    assert process.returncode == 130 and "Traceback" not in stderr
-    assert stderr.splitlines()[-1:] == [f"points: total=400 computed={found.done} reused=0 failed=0"]
 
 
 def test_second_run_on_the_same_file_is_refused(slow_process):

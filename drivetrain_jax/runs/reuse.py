@@ -1,4 +1,4 @@
-"""Reuse points of another result: a longer axis, a finer grid, one more axis, or a part of a sweep.
+"""Reuse points of another result: a longer axis, a finer grid, one more axis, a part of a sweep, or a longer list of points.
 
 Numerics (code, versions, instruction set), method, options and fixed values must be the same. Reused values meet the same
 tolerance as computed ones. Their last bits may differ, because the number of steps of a point depends on the points in its
@@ -7,7 +7,7 @@ chunk.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,8 @@ from drivetrain_jax.runs.axes import entry_of
 from drivetrain_jax.runs.explain import differences_of, not_valid
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.point_grid import Grid
-from drivetrain_jax.runs.scene import Scene, restore_scene
-from drivetrain_jax.store import checksums, gate
+from drivetrain_jax.runs.scene import Scene, restore_scene, result_variables
+from drivetrain_jax.store import checksums
 from drivetrain_jax.store.consolidate import map_variable, read_attribute
 from drivetrain_jax.store.provenance import digest
 from drivetrain_jax.store.zarr_store import is_store
@@ -55,14 +55,15 @@ class ReusableResult:
 
     path: Path
     digest: str
+    names: tuple[str, ...]
     grid: Grid
     theirs: np.ndarray
     ours: np.ndarray
     is_covered: bool
 
-    def blocks(self, names: Sequence[str]) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+    def blocks(self) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
         """Yield our points and their results in blocks, so that no result is loaded as a whole."""
-        arrays = {name: sweep_first(map_variable(self.path, name), self.grid) for name in names}
+        arrays = {name: sweep_first(map_variable(self.path, name), self.grid) for name in self.names}
         for start in range(0, self.ours.size, _BLOCK):
             place = self.grid.place(self.theirs[start : start + _BLOCK])
             results = {name: np.array(array[place]) for name, array in arrays.items()}
@@ -73,26 +74,19 @@ class ReusableResult:
 
 @dataclass(frozen=True)
 class ReusedPoints:
-    """The points reused from ``sources``, which are disjoint."""
+    """The points that a run takes from other results."""
 
-    sources: tuple[ReusableResult, ...]
-
-    @property
-    def points(self) -> np.ndarray:
-        """Numbers of the reused points, rising."""
-        return np.sort(np.concatenate([np.empty(0, np.int64), *(source.ours for source in self.sources)]))
+    sources: tuple[ReusableResult, ...] = ()
 
     @property
     def count(self) -> int:
-        """Number of reused results; every point of a path counts."""
+        """Number of points; every point of a path counts."""
         return sum(source.ours.size * source.grid.path_length for source in self.sources)
 
     @property
     def digest(self) -> str | None:
         """Digest of the sources, None without any: the chunks of the other points depend on it."""
-        if not self.sources:
-            return None
-        return digest([[source.digest, source.ours] for source in self.sources])
+        return digest([[source.digest, source.ours] for source in self.sources]) if self.sources else None
 
     @property
     def attrs(self) -> dict[str, str | int]:
@@ -101,22 +95,22 @@ class ReusedPoints:
             return {}
         return {"reused_points": self.count, "reused_from": " ".join(s.digest for s in self.sources)}
 
-    def blocks(self, names: Sequence[str]) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-        """Yield the reused points and their results ``names`` in blocks."""
+    def blocks(self) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+        """Yield the reused points and their results in blocks."""
         for source in self.sources:
-            yield from source.blocks(names)
+            yield from source.blocks()
+
+    def others(self, size: int) -> np.ndarray | None:
+        """The other ones of ``size`` points; None if nothing is reused."""
+        if not self.sources:
+            return None
+        left = np.ones(size, bool)
+        for source in self.sources:
+            left[source.ours] = False
+        return np.flatnonzero(left)
 
 
-NO_REUSE = ReusedPoints(())
-
-
-def remaining(job: Job, reused: ReusedPoints) -> Job:
-    """``job`` restricted to the points that are not reused."""
-    if not reused.sources:
-        return job
-    left = np.ones(job.grid.size, bool)
-    left[reused.points] = False
-    return job.only(np.flatnonzero(left))
+NO_REUSE = ReusedPoints()
 
 
 def combined(job: Job, found: Iterable[ReusableResult]) -> ReusedPoints:
@@ -137,11 +131,6 @@ def find(job: Job, path: Path) -> ReusableResult:
     """
     if not path.is_file():
         raise NotReusable(f"reuse = {str(path)!r}: {_no_file(path)}")
-    with gate.reading(path):
-        return _find(job, path)
-
-
-def _find(job: Job, path: Path) -> ReusableResult:
     names = ("scene", "digest", "drivetrain_jax_version", "numerics", "numerics_detail")
     attrs = {name: read_attribute(path, name) for name in names}
     if attrs["digest"] is None:
@@ -150,19 +139,16 @@ def _find(job: Job, path: Path) -> ReusableResult:
     _check_intact(path)
     grid = Grid.of(scene)
     theirs, ours = _same_points(scene, grid, job.scene, job.grid)
-    none = NotReusable(f"reuse = {str(path)!r}: holds none of the points; allowed is a result that shares some")
+    if theirs.size:
+        outcome = sweep_first(map_variable(path, OUTCOME.name), grid)[grid.place(theirs)]
+        kept = ~(outcome == Outcome.LOST).any(axis=tuple(range(1, outcome.ndim)))
+        theirs, ours = theirs[kept], ours[kept]
     if not theirs.size:
-        raise none
-    outcome = sweep_first(map_variable(path, OUTCOME.name), grid)[grid.place(theirs)]
-    kept = ~(outcome == Outcome.LOST).any(axis=tuple(range(1, outcome.ndim)))
-    if not kept.any():
-        raise none
-    theirs, ours = theirs[kept], ours[kept]
+        raise NotReusable(f"reuse = {str(path)!r}: holds none of the points; allowed is a result that shares some")
     wanted = set(scene.request.outputs) <= set(job.scene.request.outputs)
-    # Several of our points may equal one of theirs, and the reverse.
     is_covered = wanted and np.unique(theirs).size == grid.size
-    ours, first = np.unique(ours, return_index=True)
-    return ReusableResult(path, str(attrs["digest"]), grid, theirs[first], ours, is_covered)
+    stored = tuple(variable.name for variable in result_variables(job.scene))
+    return ReusableResult(path, str(attrs["digest"]), stored, grid, theirs, ours, is_covered)
 
 
 def _same_computation(path: Path, attrs: Mapping[str, Any], job: Job) -> Scene:
@@ -202,12 +188,24 @@ def _same_points(scene: Scene, grid: Grid, our_scene: Scene, our_grid: Grid) -> 
     if any(axis.also for axis in (*grid.axes, *our_grid.axes)):
         # Positions are compared by one parameter an axis.
         return nothing
-    if grid.zipped and our_grid.zipped:
-        return _same_rows(grid, our_grid)
     if grid.zipped:
-        ours, theirs = _inside(our_scene, our_grid, scene, grid)
-        return theirs, ours
-    return _inside(scene, grid, our_scene, our_grid)
+        return _same_rows(grid, our_grid)
+    axes, ours = ({axis.name: axis.values for axis in each.axes} for each in (grid, our_grid))
+    # Position along each of their axes for each value along ours; -1 for none.
+    along = {name: _match(_values(scene, axes, name), values) for name, values in ours.items()}
+    constant = {name: _match(axes[name], _values(our_scene, ours, name))[:1] for name in axes.keys() - ours.keys()}
+    if any(place.size == 0 or place[0] < 0 for place in constant.values()):
+        return nothing
+    if our_grid.zipped:
+        chosen = np.flatnonzero(np.min([*along.values()], axis=0) >= 0)
+        index = {name: place[chosen] for name, place in along.items()}
+    else:
+        kept = np.meshgrid(*(np.flatnonzero(place >= 0) for place in along.values()), indexing="ij")
+        chosen = np.ravel_multi_index([k.ravel() for k in kept], our_grid.shape) if kept else np.zeros(1, np.int64)
+        index = {name: place[k.ravel()] for (name, place), k in zip(along.items(), kept, strict=True)}
+    place = [np.broadcast_to({**constant, **index}[axis.name], chosen.shape) for axis in grid.axes]
+    theirs = np.ravel_multi_index(tuple(place), grid.shape) if place else np.zeros(chosen.shape, np.int64)
+    return np.asarray(theirs), np.asarray(chosen)
 
 
 def _same_lines(grid: Grid, other: Grid) -> bool:
@@ -236,60 +234,24 @@ def _same_fixed(scene: Scene, other: Scene) -> bool:
     return constant(scene.fixed) == constant(other.fixed)
 
 
-def _value(scene: Scene, name: str) -> float | None:
-    """The fixed number of ``scene`` for ``name``, an axis of another scene; None without one."""
+def _values(scene: Scene, axes: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:
+    """Values of a parameter, which varies along one of ``axes`` or is fixed; None if the analysis does not use it."""
     base, entry = entry_of(name)
+    if name in axes:
+        return axes[name]
+    if base not in scene.analysis.model(scene.system).parameters:
+        return None
     value = scene.fixed.get(base)
     if entry is not None:
         value = value[entry] if isinstance(value, tuple) and entry < len(value) else None
-    return value if isinstance(value, (int, float)) else None
+    return np.array([value] if isinstance(value, (int, float)) else [], float)
 
 
-def _matters(scene: Scene, name: str) -> bool:
-    return entry_of(name)[0] in scene.analysis.model(scene.system).parameters
-
-
-def _at(scene: Scene, name: str, values: np.ndarray) -> np.ndarray:
-    """0 for each of ``values`` that equals the fixed ``name`` of ``scene``, else -1."""
-    fixed = _value(scene, name)
-    if not _matters(scene, name):
-        return np.zeros(len(values), np.int64)
-    return np.full(len(values), -1) if fixed is None else _positions(np.array([fixed]), values)
-
-
-def _among(scene: Scene, name: str, values: np.ndarray) -> int:
-    """Position of the fixed ``name`` of ``scene`` among ``values``, -1 if it is missing."""
-    fixed = _value(scene, name)
-    if not _matters(scene, name):
-        return 0
-    return -1 if fixed is None else int(_positions(values, np.array([fixed]))[0])
-
-
-def _inside(scene: Scene, grid: Grid, other_scene: Scene, other: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the outer product ``grid``, and the equal points of ``other``."""
-    axes, theirs = ({axis.name: axis.values for axis in one.axes} for one in (grid, other))
-    # Position along each axis of ``grid`` for each value along the axes of ``other``; -1 for none.
-    along = {
-        name: _positions(axes[name], values) if name in axes else _at(scene, name, values)
-        for name, values in theirs.items()
-    }
-    constant = {name: _among(other_scene, name, axes[name]) for name in axes.keys() - theirs.keys()}
-    if min(constant.values(), default=0) < 0:
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    columns = [along[axis.name] for axis in other.axes]
-    if other.zipped:
-        chosen = np.flatnonzero(np.all([column >= 0 for column in columns], axis=0)) if columns else np.zeros(1, int)
-        index = {axis.name: column[chosen] for axis, column in zip(other.axes, columns, strict=True)}
-    else:
-        kept = [np.flatnonzero(column >= 0) for column in columns]
-        mesh = np.meshgrid(*kept, indexing="ij")
-        chosen = np.ravel_multi_index([m.ravel() for m in mesh], other.shape) if kept else np.zeros(1, int)
-        index = {a.name: c[m.ravel()] for a, c, m in zip(other.axes, columns, mesh, strict=True)}
-    place = [
-        np.broadcast_to(index[axis.name] if axis.name in index else constant[axis.name], chosen.shape)
-        for axis in grid.axes
-    ]
-    return (np.ravel_multi_index(tuple(place), grid.shape) if place else np.zeros(chosen.shape, int)), chosen
+def _match(theirs: np.ndarray | None, ours: np.ndarray | None) -> np.ndarray:
+    """Position among ``theirs`` for each of ``ours``, -1 for none; a parameter that is not used has any value."""
+    if theirs is None or ours is None:
+        return np.zeros(1 if ours is None else len(ours), np.int64)
+    return _positions(theirs, ours) if theirs.size and ours.size else np.full(len(ours), -1)
 
 
 def _positions(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
@@ -315,18 +277,15 @@ def _extents(rising: np.ndarray) -> np.ndarray:
 
 
 def _same_rows(grid: Grid, other: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of equal rows of two lists of points that vary the same parameters; each common row is in at least one pair."""
-    names = [axis.name for axis in grid.axes]
-    if sorted(names) != sorted(axis.name for axis in other.axes):
+    """Rows of a list of points for each equal row of another list that varies the same parameters."""
+    names = sorted(axis.name for axis in grid.axes)
+    if not other.zipped or names != sorted(axis.name for axis in other.axes):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    theirs, ours = (_rows(one, names) for one in (grid, other))
-    their_place, our_place = ({row: i for i, row in enumerate(rows)} for rows in (theirs, ours))
-    pairs = [(their_place[row], i) for i, row in enumerate(ours) if row in their_place]
-    pairs += [(i, our_place[row]) for i, row in enumerate(theirs) if row in our_place]
+    theirs, ours = (
+        list(zip(*({a.name: a.values.tolist() for a in each.axes}[name] for name in names), strict=True))
+        for each in (grid, other)
+    )
+    place = {row: i for i, row in enumerate(theirs)}
+    pairs = [(place[row], i) for i, row in enumerate(ours) if row in place]
     found = np.array(pairs, np.int64).reshape(-1, 2)
     return found[:, 0], found[:, 1]
-
-
-def _rows(grid: Grid, names: Sequence[str]) -> list[tuple[float, ...]]:
-    columns = {axis.name: axis.values.tolist() for axis in grid.axes}
-    return list(zip(*(columns[name] for name in names), strict=True))

@@ -1,0 +1,297 @@
+"""The state of the output path: nothing, unfinished work, the result, or something else."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import drivetrain_jax
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis import OUTCOME
+from drivetrain_jax.runs.explain import differences
+from drivetrain_jax.runs.job import Job, Results
+from drivetrain_jax.runs.reuse import NO_REUSE, Damaged, NotReusable, ReusableResult, ReusedPoints, combined, find
+from drivetrain_jax.runs.stores import BlockStore, ZarrBlocks
+from drivetrain_jax.store import checksums, zarr_store
+from drivetrain_jax.store.consolidate import read_attribute, read_variable
+from drivetrain_jax.store.files import behind_link, move_folder
+from drivetrain_jax.store.parts import PartsFolder
+
+HDF5, ZARR = "hdf5", "zarr"
+
+
+class Output:
+    """The result ``out`` and the folder of its parts, compared with the scene of ``job``.
+
+    ``store`` is ``hdf5`` or ``zarr``; default: the form of what is present. ``state`` is ``absent``, ``partial``,
+    ``complete`` or ``stale`` (a result or parts of another scene or version). Raises :class:`InputError` if nothing can be
+    written there, or if what is there is not a result of this package.
+    """
+
+    def __init__(self, out: Path, job: Job, store: str | None = None) -> None:
+        self.out, self.job = behind_link(out.expanduser()), job
+        self.parts = PartsFolder(self.out)
+        self._check_folders()
+        former = self.parts.path / zarr_store.FORMER
+        # A run moves the present store aside just before it moves the new one into place.
+        self.held = former if not self.out.exists() and former.exists() else self.out
+        is_store = zarr_store.is_store(self.held) or zarr_store.was_store(self.held)
+        self.store = store or (ZARR if is_store else self.parts.plan().get("store", HDF5))
+        if self.held.is_dir() and not (is_store and self.store == ZARR):
+            raise self._error("is a folder; allowed is the path of a file")
+        if self.held.exists() and not self.held.is_dir() and not (self.held.is_file() and self.store == HDF5):
+            what = "is a file; allowed for store = 'zarr' is a new path, or such a store"
+            raise self._error(what if self.store == ZARR else "not a regular file; allowed is the path of a file")
+        self.present = self._digest()
+        self._plan_seen = self.parts.plan()
+
+    def _error(self, text: str) -> InputError:
+        return InputError(f"out = {str(self.out)!r}: {text}")
+
+    def _check_folders(self) -> None:
+        folder, parts = self.out.parent, self.parts.path
+        try:
+            if not folder.is_dir():
+                raise self._error(f"the folder {str(folder)!r} does not exist; allowed is a file in an existing folder")
+            if parts.exists() and not parts.is_dir():
+                raise self._error(f"{str(parts)!r} is a file; allowed is to move it away")
+        except OSError as error:
+            raise self._error(f"{error.strerror} (with '.parts'); allowed is a shorter name") from None
+        if parts.exists() and not os.access(parts, os.R_OK | os.X_OK):
+            raise self._error(f"the folder {str(parts)!r} is not readable; allowed is one that is")
+
+    def check_writable(self) -> None:
+        """Raise :class:`InputError` if the folder of the result is not writable."""
+        for folder in (self.out.parent, self.parts.path):
+            if folder.exists() and not os.access(folder, os.W_OK | os.X_OK):
+                raise self._error(f"the folder {str(folder)!r} is not writable; allowed is a file in a writable folder")
+
+    def _digest(self) -> str | None:
+        """Digest of the present result; None without one, empty if the metadata of a store are damaged."""
+        if not self.held.exists():
+            return None
+        try:
+            found = self.attribute("digest")
+        except InputError:
+            if self.store == HDF5:
+                what = "not a readable netCDF4/HDF5 file; allowed is a new file or a result of drivetrain_jax"
+                raise self._error(what) from None
+            found = ""
+        if not isinstance(found, str):
+            raise self._error("not a result of drivetrain_jax; allowed is a new file or a result of drivetrain_jax")
+        return found
+
+    def attribute(self, name: str) -> Any:
+        """A global attribute of the present result."""
+        if self.store == ZARR:
+            return zarr_store.attributes(self.held).get(name)
+        return read_attribute(self.held, name)
+
+    @property
+    def _written(self) -> int | None:
+        """Time at which the present result was written, by the clock of its file system."""
+        file = self.held / "zarr.json" if self.held.is_dir() else self.held
+        return file.stat().st_mtime_ns if file.exists() else None
+
+    def discard(self) -> None:
+        """Delete the remains of the run that made the present result, if it was killed before it could delete them.
+
+        Work of another scene, and work that will replace the present result, stay.
+        """
+        plan = self.parts.plan()
+        replaces = (plan.get("replaces"), plan.get("replaces_written")) == (self.present, self._written)
+        if self.parts.path.exists() and plan.get("digest") in (None, self.present) and not replaces:
+            # Readers can use the result even if the remains cannot be deleted.
+            with suppress(InputError, OSError):
+                self.parts.open()
+                self.parts.close(remove=True)
+
+    def restore(self) -> None:
+        """Restore a store whose replacement was killed. Raises :class:`InputError` if that run is still working."""
+        if self.held == self.out:
+            return
+        self.check_writable()
+        self.parts.open()
+        try:
+            if not self.out.exists() and self.held.exists():
+                move_folder(self.held, self.out)
+            self.held = self.out
+        finally:
+            self.parts.close()
+
+    @cached_property
+    def state(self) -> str:
+        """``absent``, ``partial``, ``complete`` or ``stale``."""
+        if self.present == self.job.digest:
+            return "stale" if self._damage else "complete"
+        if self.parts.holds_work():
+            # Parts that replace a result are only valid for the replacement of that result.
+            return "partial" if self._agrees(self.plan(), "digest", "replaces", "store") else "stale"
+        if self.present is None:
+            return "absent"
+        return "partial" if self._grows else "stale"
+
+    def plan(self, reused: ReusedPoints = NO_REUSE, fresh: bool = False) -> dict[str, Any]:
+        """The digest of new parts, and the entries that a reader needs to interpret them."""
+        return {
+            "digest": self.job.digest,
+            "replaces": self.present,
+            "replaces_written": self._written,
+            "store": self.store,
+            "fresh": fresh,
+            "reuses": reused.digest,
+            "reused": reused.count,
+            "reused_files": [os.path.relpath(source.path, self.out.parent) for source in reused.sources],
+            **self._provenance,
+        }
+
+    @property
+    def _provenance(self) -> dict[str, str]:
+        """Attributes that explain later how stored work differs from a scene."""
+        version = {"drivetrain_jax_version": drivetrain_jax.__version__}
+        return {"scene": self.job.scene.text, **version, **self.job.numerics_attrs}
+
+    def _agrees(self, plan: dict[str, Any], *names: str) -> bool:
+        return all(self.parts.plan().get(name) == plan[name] for name in names)
+
+    def resumes(self, reused: ReusedPoints, fresh: bool) -> bool:
+        """True if a run resumes the present parts. A ``fresh`` run resumes only parts of a fresh run."""
+        if not fresh:
+            return self.parts.holds_work()
+        return self._agrees(
+            self.plan(reused, fresh), "digest", "replaces", "replaces_written", "store", "reuses", "fresh"
+        )
+
+    def check_unchanged(self) -> None:
+        """Raise :class:`InputError` if another run has finished or started since this object was created."""
+        if (self._digest(), self.parts.plan()) != (self.present, self._plan_seen):
+            raise self._error("another run has changed it; run the command again")
+
+    @cached_property
+    def _damage(self) -> str:
+        """The damaged parts of the present result of this scene, or of one whose digest is damaged; empty without damage."""
+        if self.present not in (self.job.digest, ""):
+            return ""
+        if self.store == ZARR:
+            return zarr_store.damage(self.held)
+        changed = checksums.damaged(self.held)
+        return "its checksums are gone" if changed is None else checksums.named(changed)
+
+    @cached_property
+    def _found(self) -> ReusableResult | NotReusable | None:
+        """The points of this scene in the present result, the reason why it has none, or None if none can be reused."""
+        if self.present is None or self.store == ZARR or self.job.scene.analysis.continuous:
+            return None
+        try:
+            return find(self.job, self.held)
+        except NotReusable as error:
+            return error
+
+    @property
+    def _shared(self) -> ReusableResult | None:
+        return self._found if isinstance(self._found, ReusableResult) else None
+
+    @property
+    def _grows(self) -> bool:
+        """True if this scene contains all points of the present result, so replacing it loses nothing."""
+        return self._shared is not None and self._shared.is_covered
+
+    def reused_points(self, reuse: Sequence[str | Path], fresh: bool) -> ReusedPoints:
+        """The points that a run reuses from the results ``reuse`` and, unless it is ``fresh``, from the present result.
+
+        Raises :class:`InputError` if unfinished work uses other results, or if one of ``reuse`` has no common points.
+        """
+        if reuse and self.store == ZARR:
+            raise InputError("reuse: given together with store = 'zarr'; allowed is one of them")
+        if reuse and not self.job.route.is_pointwise:
+            raise InputError("reuse: not available for an atlas; allowed for a scene with direct solves")
+        if not self.job.route.is_pointwise:
+            return NO_REUSE
+        paths = [Path(path) for path in reuse]
+        found = [find(self.job, path) for path in paths]
+        # Unfinished fresh work is resumed as fresh.
+        if not (fresh or self.parts.plan().get("fresh")):
+            if isinstance(self._found, Damaged):
+                raise self.refusal
+            found += [self._shared] if self._shared is not None and self._grows else []
+        reused = combined(self.job, found)
+        if not fresh and self.parts.holds_work() and self.parts.plan().get("reuses") != reused.digest:
+            files = ", ".join(self.parts.plan().get("reused_files") or ["no other result"])
+            raise InputError(
+                f"reuse = {[str(p) for p in paths]}: the unfinished work at {str(self.out)!r} takes points from {files}; "
+                "allowed is the same again, or --fresh"
+            )
+        return reused
+
+    @property
+    def blocks(self) -> BlockStore:
+        """The store of unfinished work."""
+        return ZarrBlocks.among(self.parts, self.job) if self.store == ZARR else self.parts.blocks
+
+    def finished(self) -> Iterator[tuple[np.ndarray, Results]]:
+        """Yield points and results of unfinished work, reused ones included."""
+        if self.parts.holds_work():
+            names = self.parts.plan().get("reused_files") or ()
+            reused = combined(self.job, [find(self.job, self.out.parent / name) for name in names])
+        else:
+            reused = self.reused_points((), fresh=False)
+        yield from reused.blocks()
+        stored = set(self.blocks.numbers())
+        for block in self.job.blocks(reused.others(self.job.grid.size)):
+            if block.number in stored and (results := self.blocks.read(block.number)) is not None:
+                yield self.job.points(block), results
+
+    @property
+    def refusal(self) -> InputError:
+        """The message of a run that may not replace the present result."""
+        return self._error(f"holds {self.obstacle}; {self.remedy}")
+
+    @property
+    def remedy(self) -> str:
+        """The remedy for the :attr:`obstacle`."""
+        replaces = "--fresh replaces it (fresh=True in Python)"
+        if self._shared is None or self.parts.holds_work():
+            return replaces
+        kept = f"--reuse {self.out.name} with another --out takes {ReusedPoints((self._shared,)).count} points from it"
+        return f"{replaces}, {kept}"
+
+    @property
+    def obstacle(self) -> str:
+        """The reason why a run stops or would stop; empty without one."""
+        what = self._damage or (self._found.what if isinstance(self._found, Damaged) else "")
+        if what:
+            return f"a damaged result ({what})"
+        if self.parts.holds_work():
+            stored, what = self.parts.plan(), "unfinished work"
+            if self.present != stored.get("replaces"):
+                return f"{what} that was started for another result"
+            if self.store != stored.get("store"):
+                return f"{what} of --store {stored.get('store')}"
+        else:
+            stored, what = {name: self.attribute(name) for name in self._provenance}, "a result"
+        reasons = differences(stored, self.job)
+        more = f" and {len(reasons) - 2} more" if len(reasons) > 2 else ""
+        return f"{what} of another scene or version: {'; '.join(reasons[:2]) or 'other sizes of chunks'}{more}"
+
+    @property
+    def outcomes(self) -> np.ndarray:
+        """Outcomes of the points of the complete result. An atlas has no points."""
+        if self._solves is not None:
+            return np.empty(0, OUTCOME.dtype)
+        read = zarr_store.read_variable if self.store == ZARR else read_variable
+        return read(self.held, OUTCOME.name)
+
+    def points(self, total: int) -> int:
+        """Number of points of the complete result, or of solves of an atlas."""
+        return total if self._solves is None else self._solves
+
+    @property
+    def _solves(self) -> int | None:
+        value = self.attribute("solves")
+        return None if value is None else int(np.squeeze(value))

@@ -1,0 +1,119 @@
+"""Stores of finished blocks: files that are joined at the end, or the shards of a Zarr store."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from drivetrain_jax._errors import ChunkError
+from drivetrain_jax.analysis import OUTCOME
+from drivetrain_jax.runs.assemble import PENDING, missing_value, template, with_pending
+from drivetrain_jax.runs.job import Job, Results
+from drivetrain_jax.runs.scene import result_variables
+from drivetrain_jax.store import zarr_store
+from drivetrain_jax.store.files import flush_tree, move_folder
+from drivetrain_jax.store.parts import PartsFolder
+from drivetrain_jax.store.schema import Labelled
+
+
+class BlockStore(Protocol):
+    """Keeps the results of blocks, points first; every worker that computes blocks must see ``place``."""
+
+    @property
+    def place(self) -> str:
+        """Absolute path of the store."""
+        ...
+
+    def numbers(self) -> list[int]:
+        """Numbers of the stored blocks, damaged ones included."""
+        ...
+
+    def write(self, number: int, results: Results) -> None:
+        """Store the results of a block."""
+
+    def read(self, number: int) -> Results | None:
+        """The results of a block; None if it is missing or damaged."""
+        ...
+
+
+@dataclass(frozen=True)
+class ZarrBlocks:
+    """The blocks of ``job`` as shards of the Zarr store at ``place``, each with a checksum that marks it as done."""
+
+    job: Job
+    place: str
+
+    @classmethod
+    def among(cls, parts: PartsFolder, job: Job) -> ZarrBlocks:
+        """The growing store among the parts."""
+        return cls(job, os.path.abspath(parts.path / zarr_store.UNFINISHED))
+
+    def create(self) -> None:
+        """Create the store, unless a stopped run has left exactly that."""
+        path, blank = Path(self.place), self.template
+        # Moved in one step, so the store at this path is always whole.
+        half = path.with_name("half")
+        shutil.rmtree(half, ignore_errors=True)
+        fills = {v.name: missing_value(v) for v in result_variables(self.job.scene)} | {OUTCOME.name: PENDING}
+        zarr_store.create(half, with_pending(blank), self.job.boxes, fills)
+        if zarr_store.matches(path, half):
+            shutil.rmtree(half)
+            return
+        shutil.rmtree(path, ignore_errors=True)
+        flush_tree(half)
+        move_folder(half, path)
+
+    @property
+    def template(self) -> Labelled:
+        """The result without its data."""
+        return template(self.job.scene, self.job.grid, self.job.attrs)
+
+    def numbers(self) -> list[int]:
+        """Numbers of the shards that are marked done."""
+        return np.flatnonzero(zarr_store.done(Path(self.place))).tolist() if os.path.isdir(self.place) else []
+
+    def write(self, number: int, results: Results) -> None:
+        """Write a shard and mark it done."""
+        grid, box = self.job.grid, self.job.boxes.place(number)
+        position, arrays = grid.path_position, {}
+        sizes = [part.stop - part.start for axis, part in enumerate(box) if axis != position]
+        for name, values in results.items():
+            # A fixed path parameter is not a dimension of the result.
+            rows = values[:, 0] if grid.path_is_fixed else values
+            rows = rows.reshape((*sizes, *rows.shape[1:]))
+            arrays[name] = rows if position is None else np.moveaxis(rows, len(sizes), position)
+        zarr_store.write(Path(self.place), box, arrays, number)
+
+    def read(self, number: int) -> Results | None:
+        """The results of a shard."""
+        grid, found = self.job.grid, zarr_store.read(Path(self.place), self.job.boxes, number)
+        if found is None:
+            return None
+        rows = {}
+        for name, values in found.items():
+            moved = values if grid.path_position is None else np.moveaxis(values, grid.path_position, len(grid.shape))
+            moved = moved.reshape(-1, *moved.shape[len(grid.shape) :])
+            rows[name] = moved[:, None] if grid.path_is_fixed else moved
+        return rows
+
+    def finish(self, parts: PartsFolder, **attrs: str | float) -> None:
+        """Move the store into place. A former one is set aside first, because a directory cannot be replaced in one step.
+
+        Raises :class:`ChunkError` if a shard that a worker reported as written is missing.
+        """
+        path, final = Path(self.place), self.template
+        absent = int(np.sum(~zarr_store.done(path)))
+        if absent:
+            raise ChunkError(f"{absent} shards are missing; every worker must see the store at {self.place!r}")
+        zarr_store.seal(path, {**final.attrs, **attrs}, {OUTCOME.name: final.data[OUTCOME.name].attrs})
+        flush_tree(path)
+        former = parts.path / zarr_store.FORMER
+        if parts.out.exists():
+            shutil.rmtree(former, ignore_errors=True)
+            move_folder(parts.out, former)
+        move_folder(path, parts.out)

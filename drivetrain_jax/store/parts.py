@@ -1,0 +1,143 @@
+"""Unfinished work: the folder ``FILE.nc.parts/`` with its plan, its lock, and a file of each finished block."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import io
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import FileLock, Timeout
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.store.files import behind_link, sync_folder, write_atomic
+
+Arrays = Mapping[str, np.ndarray]
+
+
+class BlockFiles:
+    """Finished blocks as files in a folder, each with the digest of its bytes in its name; damaged ones do not count."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    @property
+    def place(self) -> str:
+        """The folder, under the name by which workers find it."""
+        return os.path.abspath(self._folder)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return BlockFiles, (Path(self.place),)
+
+    def numbers(self) -> list[int]:
+        """Numbers of the blocks that have a file, damaged ones included."""
+        return sorted({int(path.name[:8]) for path in self._folder.glob("*-*.npz")})
+
+    def write(self, number: int, results: Arrays) -> None:
+        """Store the results of a block."""
+        file = io.BytesIO()
+        np.savez(file, **results)  # pyright: ignore[reportArgumentType]
+        data = file.getbuffer()
+        path = self._folder / f"{number:08d}-{_digest(data)}.npz"
+        write_atomic(path, data, path.with_suffix(f".{os.getpid()}.tmp"))
+
+    def read(self, number: int) -> Arrays | None:
+        """The results of a block; None if it is missing or damaged."""
+        for path in self._folder.glob(f"{number:08d}-*.npz"):
+            with suppress(OSError):
+                data = path.read_bytes()
+                if _digest(data) == path.stem.partition("-")[2]:
+                    with np.load(io.BytesIO(data)) as file:
+                        return dict(file)
+        return None
+
+
+def _digest(data: bytes | memoryview) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()
+
+
+class PartsFolder:
+    """The folder beside the result ``out``. Writing needs an open folder (``open``, ``close``), reading does not."""
+
+    def __init__(self, out: Path) -> None:
+        # All links to a file share one folder, and so one lock.
+        out = behind_link(out)
+        self.out, self.path = out, out.parent / f"{out.name}.parts"
+        # Path at which the result grows.
+        self.result = self.path / "result.tmp"
+        self.blocks = BlockFiles(self.path)
+        self._plan = self.path / "plan.json"
+        self._lock: FileLock | None = None
+
+    def plan(self) -> dict[str, Any]:
+        """The plan of the blocks; empty without a readable plan.
+
+        It has the ``digest``, ``replaces`` (the digest of the result that the blocks will replace), and more about the run.
+        """
+        try:
+            content = json.loads(self._plan.read_bytes())
+        except (OSError, ValueError):
+            return {}
+        return content if isinstance(content, dict) else {}
+
+    def holds_work(self) -> bool:
+        """True if there is work to resume or to report; a run killed at its start leaves none."""
+        return bool(self.plan())
+
+    def open(self) -> None:
+        """Create and lock the folder, without a change of its content.
+
+        Raises :class:`InputError` if another run has locked the folder, or if it cannot be created or locked.
+        """
+        file = self.path / "lock"
+        while True:
+            self._make()
+            lock = FileLock(file, timeout=0)
+            try:
+                lock.acquire()
+            except Timeout:
+                raise InputError(f"out = {str(self.path)!r}: another run is working on it; wait or stop it") from None
+            except FileNotFoundError:
+                continue
+            # Another run may have removed the folder between mkdir and lock.
+            if os.path.exists(file):
+                self._lock = lock
+                return
+            lock.release()
+
+    def _make(self) -> None:
+        try:
+            self.path.mkdir(exist_ok=True)
+            sync_folder(self.path.parent)
+        except OSError as error:
+            # A full disk may have space later.
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            text = f"out = {str(self.path)!r}: {error.strerror}; allowed is a path in a writable folder"
+            raise InputError(text) from None
+
+    def start(self, plan: Mapping[str, Any]) -> None:
+        """Delete all blocks and start those of ``plan``."""
+        self._plan.unlink(missing_ok=True)
+        for entry in self.path.iterdir():
+            if entry.is_dir():
+                shutil.rmtree(entry)
+            elif entry.name != "lock":
+                entry.unlink()
+        write_atomic(self._plan, json.dumps(dict(plan)).encode(), self.path / "plan.tmp")
+
+    def close(self, remove: bool = False) -> None:
+        """Unlock the folder, or delete it with its content."""
+        if self._lock is None:
+            return
+        if remove:
+            shutil.rmtree(self.path, ignore_errors=True)
+        self._lock.release()
+        self._lock = None
