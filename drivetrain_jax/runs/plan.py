@@ -49,6 +49,7 @@ def block_size(solvers: Sequence[Solver], grid: Grid) -> int:
     sample = np.unique(np.linspace(0, grid.size - 1, min(grid.size, _SAMPLE)).astype(np.int64))
     choice, effort = _cheapest(solvers, grid, sample)
     seconds = float(np.mean(effort * np.array([*(solver.seconds for solver in solvers), 0.0])[choice]))
+    seconds *= grid.path_length
     lines = max(min(_MOST_POINTS, _MOST_BYTES // max(grid.result_bytes, 1)) // grid.path_length, 1)
     least = max(solver.chunk * (1 if solver.lengthy else _LEAST_CHUNKS) for solver in solvers)
     wanted = math.ceil(_SECONDS / seconds) if seconds > _SECONDS / lines else lines

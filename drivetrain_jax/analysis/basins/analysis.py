@@ -120,7 +120,7 @@ def shares(high: Array, low: Array, multiple: Array, outcome: Array) -> dict[str
 
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     build = system.models["basins"].build
-    return (Solver("exact", partial(_solve, build, request), chunk=_CHUNK),)
+    return (Solver("exact", partial(_solve, build, request), seconds=5e-2, chunk=_CHUNK),)
 
 
 ANALYSIS = Analysis(

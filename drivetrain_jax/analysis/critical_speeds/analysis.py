@@ -193,7 +193,7 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
         room = min(room, _STATIONS_PER_CHUNK // (modes * request.options["stations"]))
     chunk = 1 << max(min(room, 2048), 16).bit_length() - 1
     solve = partial(_solve, build, request)
-    return (Solver(request.method, solve, chunk=chunk),)
+    return (Solver(request.method, solve, seconds=2e-5, chunk=chunk),)
 
 
 def _derivatives(

@@ -76,7 +76,17 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
         found = rtol ** (1 / 8 - 1 / order) * traced_steps(build, values, rtol)
         return jnp.minimum(found, MAX_STEPS).astype(jnp.int64)
 
-    return (Solver(f"diffrax: {request.options['solver']}, equal steps", solve, effort, steps, chunk=256, march=True),)
+    return (
+        Solver(
+            f"diffrax: {request.options['solver']}, equal steps",
+            solve,
+            effort,
+            steps,
+            seconds=1e-6,
+            chunk=256,
+            march=True,
+        ),
+    )
 
 
 def _records(build: Build, values: Mapping[str, Any], panels: Array, natural: bool = False) -> Propagator:
@@ -158,7 +168,7 @@ def adaptive_steps(system: type[System], request: Request) -> tuple[Solver, ...]
         return np.nan_to_num(found) if issubclass(type(solver), diffrax.AbstractImplicitSolver) else found
 
     name = f"diffrax: {request.options['solver']}, {request.options['form']}, adaptive steps"
-    return (Solver(name, over_lanes(solve), effort, chunk=256),)
+    return (Solver(name, over_lanes(solve), effort, seconds=1e-6, chunk=256),)
 
 
 def _in_equal_steps(form: LinearPeriodic, solver: diffrax.AbstractSolver, steps: Array) -> Array:

@@ -60,6 +60,7 @@ def direct_solvers(
             solve,
             effort,
             lambda values: traced_panels(build, values, rtol),
+            seconds=1e-6,
             chunk=chunk,
             march=True,
             short_loops=True,

@@ -232,7 +232,7 @@ def _exact_branch(
 
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     build = system.models["frequency_response"].build
-    return (Solver(request.method, partial(_solve, build, request), chunk=_CHUNK),)
+    return (Solver(request.method, partial(_solve, build, request), seconds=1e-3, chunk=_CHUNK),)
 
 
 def _of_system(system: type[System]) -> dict[str, Any]:

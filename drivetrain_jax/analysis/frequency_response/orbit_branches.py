@@ -66,7 +66,7 @@ def dimensions(system: type[System], request: Request, fixed: Mapping[str, Any])
 def solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     """The solver of lines."""
     solve = over_lanes(partial(_solve, system, request))
-    return (Solver("continuation", solve, chunk=8, march=True, short_loops=True, lengthy=True),)
+    return (Solver("continuation", solve, seconds=1e-2, chunk=8, march=True, short_loops=True, lengthy=True),)
 
 
 def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:

@@ -375,7 +375,7 @@ def _of_system(system: type[System]) -> dict[str, Any]:
 
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     solve, effort = partial(_solve, system, request), partial(_effort, system, request)
-    return (Solver("tangent", solve, effort, chunk=_CHUNK, march=True, lengthy=True),)
+    return (Solver("tangent", solve, effort, seconds=3e-7, chunk=_CHUNK, march=True, lengthy=True),)
 
 
 ANALYSIS = Analysis(

@@ -44,7 +44,7 @@ def _solve(system: type[System], request: Request, values: Mapping[str, Any], ef
 
 
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
-    return (Solver("closed form", partial(_solve, system, request), chunk=4096),)
+    return (Solver("closed form", partial(_solve, system, request), seconds=1e-7, chunk=4096),)
 
 
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:

@@ -317,9 +317,9 @@ def _effort(request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     solve, effort = partial(_solve, system, request), partial(_effort, request)
     if request.method == "adaptive":
-        return (Solver("adaptive", over_lanes(solve), effort, chunk=16, march=True, lengthy=True),)
+        return (Solver("adaptive", over_lanes(solve), effort, seconds=3e-5, chunk=16, march=True, lengthy=True),)
     chunk = max(1, min(_CHUNK, _NUMBERS // (2 * request.options["strobes"])))
-    return (Solver("fixed", solve, effort, chunk=chunk, march=True, lengthy=True),)
+    return (Solver("fixed", solve, effort, seconds=1e-6, chunk=chunk, march=True, lengthy=True),)
 
 
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:

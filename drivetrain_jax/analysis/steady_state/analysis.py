@@ -187,8 +187,8 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
         return np.where(system.models["steady_state"].build(columns).oscillates, 1.0, np.inf)
 
     return (
-        Solver("exact", partial(_solve, system, request, False), chunk=_CHUNK, unit_cost=1.15),
-        Solver("underdamped", partial(_solve, system, request, True), effort, chunk=_CHUNK),
+        Solver("exact", partial(_solve, system, request, False), seconds=3e-4, chunk=_CHUNK, unit_cost=1.15),
+        Solver("underdamped", partial(_solve, system, request, True), effort, seconds=3e-4, chunk=_CHUNK),
     )
 
 
