@@ -102,7 +102,7 @@ def _remarks(progress: Any, out: Path) -> str:
     """The note of a finished run, and its values that miss the tolerance."""
     remarks = [progress.note] if progress.note else []
     if progress.inaccurate:
-        from drivetrain_jax.runs.misses import missed
+        from drivetrain_jax.runs.status import missed
 
         remarks.append(missed(out, progress.inaccurate, progress.total))
     return "; ".join(remarks)
@@ -147,7 +147,7 @@ def export(options: argparse.Namespace) -> int:
         return OK
     if options.file is None:
         raise InputError("FILE.nc: missing; allowed is a new file, or --csv for a table")
-    from drivetrain_jax.runs.export import export
+    from drivetrain_jax.runs.stores import export
 
     sys.stderr.write(f"points: {export(options.store, options.file)} exported\n")
     return OK

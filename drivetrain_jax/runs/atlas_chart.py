@@ -24,8 +24,7 @@ from drivetrain_jax.atlas.exclusion import Search
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.tips import Tips, find_tips
 from drivetrain_jax.atlas.windows import narrow
-from drivetrain_jax.runs.atlas_file import StoredAtlas, open_atlas
-from drivetrain_jax.runs.atlas_values import as_given, check_same
+from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, check_same, open_atlas
 from drivetrain_jax.runs.axes import in_unit
 from drivetrain_jax.runs.identity import program_identity
 from drivetrain_jax.runs.physical import in_parameters

@@ -20,24 +20,66 @@ from drivetrain_jax.analysis.request import make_request
 from drivetrain_jax.atlas import StabilityAtlas, from_arrays, stability_atlas, to_arrays
 from drivetrain_jax.atlas.floquet import floquet_domain
 from drivetrain_jax.runs.assemble import ResultBuffer, labelled, result_attrs, to_dataset
-from drivetrain_jax.runs.atlas_values import as_given, broadcast, check_same
+from drivetrain_jax.runs.atlas_choice import atlas_ranges
 from drivetrain_jax.runs.axes import Axis
 from drivetrain_jax.runs.executors import Threads
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.physical import in_parameters
 from drivetrain_jax.runs.programs import kept
-from drivetrain_jax.runs.routes import DIRECT
+from drivetrain_jax.runs.reuse import ReusedPoints
+from drivetrain_jax.runs.rounds import build_atlas
 from drivetrain_jax.runs.scene import Scene, restore_scene
 from drivetrain_jax.runs.through_atlas import evaluate
-from drivetrain_jax.runs.work import Progress, Work
+from drivetrain_jax.runs.work import DIRECT, Progress, Route, Work
 from drivetrain_jax.store import checksums
-from drivetrain_jax.store.consolidate import open_result, read_plain
+from drivetrain_jax.store.consolidate import open_result, read_plain, write_result
+from drivetrain_jax.store.files import ATLAS_PREFACE
 from drivetrain_jax.store.schema import Entry, Labelled
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from drivetrain_jax.explore import Page
+
+# Relative tolerance within which a value equals a fixed parameter of an atlas.
+SAME_FIXED = 5e-4
+
+
+def check_same(name: str, value: Any, fixed: float, source: str = "") -> None:
+    """Raise :class:`InputError` unless ``value`` is the ``fixed`` one of the atlas, which may be typed with four digits.
+
+    ``source`` names the physical data from which it follows.
+    """
+    if isinstance(value, tuple) or not np.allclose(value, fixed, rtol=SAME_FIXED, atol=0):
+        made = f"the atlas is made for {name} = {fixed:.10g}"
+        given = f"{name} = {as_given(value)}" + (f" (from {source})" if source else "")
+        raise InputError(f"{given}: {made}; allowed is that value")
+
+
+def as_given(value: Any) -> str:
+    """A number or a range as text: ``1.3:1.5``."""
+    ends = value if isinstance(value, tuple) else (value,)
+    return ":".join(f"{end:.10g}" if isinstance(end, (int, float)) else shown(end) for end in ends)
+
+
+def broadcast(given: Mapping[str, Any]) -> tuple[xr.DataArray, ...]:
+    """Arrays of one shape: unlabelled ones are broadcast by position, then all by dimension names."""
+    import xarray as xr
+
+    plain = {name: np.asarray(v, float) for name, v in given.items() if not isinstance(v, xr.DataArray)}
+    try:
+        plain = dict(zip(plain, np.broadcast_arrays(*plain.values()), strict=True))
+        labelled: dict[str, Any] = {
+            n: xr.DataArray(v, dims=("point",) if v.ndim == 1 else None) for n, v in plain.items()
+        }
+        arrays = [labelled.get(name, value) for name, value in given.items()]
+        # The default of `broadcast` is the union of labels, with NaN for missing ones.
+        return xr.broadcast(*xr.align(*arrays, join="exact", copy=False))
+    except ValueError:
+        shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in given.items())
+        allowed = "arrays that broadcast against each other, of the same labels along a dimension that they share"
+        raise InputError(f"shapes {shapes}: allowed are {allowed}") from None
+
 
 # Values along each axis of the stored chart.
 _CELLS = 256
@@ -366,3 +408,22 @@ class StoredAtlas:
         fixed = dict(scene.fixed) | {name: value for name, value in fixed.items() if name not in axes}
         floquet = get_analysis("floquet").for_system(system)
         return Scene(system, floquet, request, columns, zipped, fixed, scene.title, scene.text, scene.data)
+
+
+class AtlasRoute(Route):
+    """Builds an atlas; progress counts its solves, which are not points of a grid."""
+
+    name = "an atlas"
+    is_pointwise = False
+
+    def in_memory(self, job: Job, work: Work, progress: Progress) -> Labelled:
+        """The atlas; ``progress`` counts the solves."""
+        stability, _ = build_atlas(job.scene, atlas_ranges(job.scene), work, progress)
+        return to_labelled(stability, job.scene).with_attrs(**job.attrs)
+
+    def into_file(
+        self, job: Job, out: Path, temporary: Path, work: Work, progress: Progress, reused: ReusedPoints
+    ) -> None:
+        """Write the atlas from stored and newly computed solves."""
+        result = self.in_memory(job, work, progress).with_attrs(wall_time_s=work.elapsed)
+        write_result(result, out, temporary, ATLAS_PREFACE)

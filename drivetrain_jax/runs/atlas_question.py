@@ -9,8 +9,7 @@ from typing import Any
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.runs import toml
-from drivetrain_jax.runs.atlas_file import StoredAtlas
-from drivetrain_jax.runs.atlas_values import as_given, check_same
+from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, check_same
 from drivetrain_jax.runs.physical import GivenData, in_parameters
 
 Range = tuple[float, float]

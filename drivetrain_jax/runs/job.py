@@ -28,7 +28,7 @@ from drivetrain_jax.store.provenance import digest
 from drivetrain_jax.store.shards import Shards
 
 if TYPE_CHECKING:
-    from drivetrain_jax.runs.routes import Route
+    from drivetrain_jax.runs.work import Route
 
 # Most kernels that are compiled in parallel.
 _SIDE_BY_SIDE = 8

@@ -14,15 +14,15 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax._wording import aligned, did_you_mean, meant, shown, written
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, get_analysis
+from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range, orders_of
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.forced_limit import Limit
 from drivetrain_jax.runs.growth_text import growth_lines, growth_of, speed_in_rpm
 from drivetrain_jax.runs.job import Job
-from drivetrain_jax.runs.order_crossings import OrderCrossings, order_crossings
 from drivetrain_jax.runs.physical import described
 from drivetrain_jax.runs.resolve import resolve
-from drivetrain_jax.runs.scene import load_scene, system_and_analysis
+from drivetrain_jax.runs.scene import Scene, load_scene, system_and_analysis
 
 
 @dataclass(frozen=True)
@@ -316,3 +316,40 @@ def _labels(job: Job, values: Mapping[str, Any], buffer: ResultBuffer) -> dict[s
     shown = [v for v in buffer.variables if v.name in values]
     sizes = {dim: n for v in shown for dim, n in zip(v.dims, np.shape(values[v.name]), strict=True)}
     return {d.name: d.labels(sizes[d.name]) for d in job.scene.dimensions if d.name in sizes}
+
+
+@dataclass(frozen=True)
+class OrderCrossings:
+    """The ``orders`` with their ``speeds`` (modes, orders) [rpm], and the operating range [rpm] if one is given."""
+
+    orders: Orders
+    speeds: np.ndarray
+    operating: tuple[float, float] | None
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """The speeds of all modes by the name of the order."""
+        return dict(zip(self.orders.per_turn, self.speeds.T, strict=True))
+
+    def lines(self) -> list[str]:
+        """The speeds as a table, and those within the operating range as sentences."""
+        head = ["mode", *(f"{name} [rpm]" for name in self.columns)]
+        modes = [
+            [str(k), *(f"{x:.6g}" if np.isfinite(x) else "-" for x in row)] for k, row in enumerate(self.speeds, 1)
+        ]
+        lines = [f"  speed of the {self.orders.shaft} at which an order meets the mode", *aligned([head, *modes])]
+        if self.operating:
+            low, high = self.operating
+            within = self.orders.within(self.speeds, low, high)
+            lines += [f"  from {low:g} to {high:g} rpm: {sentence}" for sentence in within]
+        return lines
+
+
+def order_crossings(scene: Scene, parameters: Mapping[str, Any], values: Mapping[str, Any]) -> OrderCrossings | None:
+    """The crossings of the frequencies among the results ``values`` of one point; None without frequencies or orders."""
+    name = next((name for name in FREQUENCIES if name in values), None)
+    orders = orders_of(scene.system.name, {**parameters, **scene.data})
+    if name is None or orders is None:
+        return None
+    frequency = in_hertz(values[name], scene.analysis.variable(name).units)
+    return OrderCrossings(orders, orders.speeds(frequency), operating_range(scene.request.options))

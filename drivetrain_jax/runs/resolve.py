@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from drivetrain_jax.runs.atlas_choice import choose_atlas
 from drivetrain_jax.runs.job import Job
-from drivetrain_jax.runs.routes import DIRECT, Route
 from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.runs.work import DIRECT, Route
 
 
 def resolve(scene: Scene) -> Job:
@@ -16,7 +16,7 @@ def resolve(scene: Scene) -> Job:
 def _route(scene: Scene) -> Route:
     # Local imports: scenes without an atlas do without its modules.
     if scene.analysis.continuous:
-        from drivetrain_jax.runs.atlas_route import AtlasRoute
+        from drivetrain_jax.runs.atlas_file import AtlasRoute
 
         return AtlasRoute()
     if choice := choose_atlas(scene):

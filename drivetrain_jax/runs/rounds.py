@@ -22,9 +22,8 @@ from drivetrain_jax.atlas import (
 from drivetrain_jax.atlas.construction import MAX_SOLVES
 from drivetrain_jax.runs.axes import Axis
 from drivetrain_jax.runs.job import Job
-from drivetrain_jax.runs.routes import DIRECT
 from drivetrain_jax.runs.scene import Problem, Scene
-from drivetrain_jax.runs.work import Progress, Work
+from drivetrain_jax.runs.work import DIRECT, Progress, Work
 
 # Ratio of the tolerance of the panels to that of the results.
 _SHARPER = 0.1

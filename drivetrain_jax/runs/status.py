@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from drivetrain_jax.runs.output import Output
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene, restore_scene
 from drivetrain_jax.store import checksums, consolidate
+from drivetrain_jax.store.netcdf import opened
 from drivetrain_jax.store.parts import PartsFolder
 
 if TYPE_CHECKING:
@@ -134,3 +135,29 @@ def open_result(path: str | Path) -> xr.Dataset:
     found = labelled(job.scene, buffer.lay_out(), {"digest": job.digest, "points_done": count})
     title = f"{job.scene.title} (unfinished: {count} of {job.total} points)"
     return with_pending(found).with_attrs(title=title).to_dataset()
+
+
+_BOUND, _VERDICT, _UNDECIDED = "spectral_radius_error", "verdict", 2
+
+
+def missed(out: Path, count: int, total: int) -> str:
+    """The remark about ``count`` of ``total`` values of the result at ``out``; a Zarr store gives only these numbers."""
+    text = f"{count:,} of {total:,} values {'misses' if count == 1 else 'miss'} the tolerance"
+    mark = f"{OUTCOME.name} = {int(Outcome.TOLERANCE_NOT_MET)} marks {'it' if count == 1 else 'them'}"
+    if out.is_dir():
+        return f"{text}; {mark}"
+    with cast(Any, opened(out)) as file:
+        rtol = json.loads(file.attrs.get("options", "{}")).get("rtol")
+        text += f" {rtol:g}" if rtol else ""
+        outcome = file[OUTCOME.name]
+        places = np.flatnonzero(outcome[()] == Outcome.TOLERANCE_NOT_MET)
+        if _BOUND in file:
+            bounds = file[_BOUND][()].reshape(-1)[places]
+            place = np.unravel_index(places[np.argmax(bounds)], outcome.shape)
+            axes = {dim[0].name.strip("/"): dim[0][i] for dim, i in zip(outcome.dims, place, strict=True)}
+            at = ", ".join(f"{name} = {value:.6g}" for name, value in axes.items())
+            text += f" (largest error bound {bounds.max():.1e}, at {at})"
+        if _VERDICT in file:
+            undecided = int((file[_VERDICT][()].reshape(-1)[places] == _UNDECIDED).sum())
+            text += f"; {undecided:,} of them undecided" if undecided else "; the verdicts are decided"
+    return f"{text}; {mark}"

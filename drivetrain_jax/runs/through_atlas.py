@@ -17,8 +17,7 @@ from drivetrain_jax.runs.atlas_choice import Ranges
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.reuse import ReusedPoints
 from drivetrain_jax.runs.rounds import build_atlas, fixed_of
-from drivetrain_jax.runs.routes import Route
-from drivetrain_jax.runs.work import Progress, Work
+from drivetrain_jax.runs.work import Progress, Route, Work
 
 # Cells evaluated at a time; determines memory and the interval of progress reports.
 _BLOCK = 1 << 21

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -13,9 +14,13 @@ import numpy as np
 from drivetrain_jax._errors import RetryableError
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.runs.assemble import ResultBuffer, labelled
 from drivetrain_jax.runs.executors import Executor
 from drivetrain_jax.runs.job import Block, Job, Results
+from drivetrain_jax.runs.reuse import NO_REUSE, ReusedPoints
 from drivetrain_jax.runs.stores import BlockStore
+from drivetrain_jax.store.consolidate import ResultFile
+from drivetrain_jax.store.schema import Labelled
 
 
 @dataclass
@@ -166,3 +171,42 @@ class Work:
     def _report(self, progress: Progress) -> None:
         if self.report:
             self.report(progress)
+
+
+class Route:
+    """The way from a job to its result, chosen once by :func:`~drivetrain_jax.runs.resolve.resolve`: solves every point."""
+
+    # Name of the route; a part of the digest, because the route affects the bits.
+    name = "direct solves"
+    # True if points are solved one by one, so that partial results can be opened, reused and written by workers.
+    is_pointwise = True
+
+    def fill(
+        self, job: Job, buffer: ResultBuffer, work: Work, progress: Progress, reused: ReusedPoints
+    ) -> dict[str, str | int]:
+        """Copy the points ``reused`` and solve the others; returns attributes of the result."""
+        for points, results in reused.blocks():
+            buffer.fill(points, results)
+            progress.reused += results[OUTCOME.name].size
+            progress.count(results[OUTCOME.name])
+        work.do(job, buffer, progress, points=reused.others(job.grid.size))
+        return reused.attrs
+
+    def in_memory(self, job: Job, work: Work, progress: Progress) -> Labelled:
+        """The result."""
+        buffer = ResultBuffer(job.scene, job.grid)
+        extra = self.fill(job, buffer, work, progress, NO_REUSE)
+        return labelled(job.scene, buffer.lay_out(), job.attrs | extra)
+
+    def into_file(
+        self, job: Job, out: Path, temporary: Path, work: Work, progress: Progress, reused: ReusedPoints
+    ) -> None:
+        """Write the result from the points ``reused``, the stored blocks, and newly computed ones."""
+        with ResultFile(temporary) as file:
+            buffer = ResultBuffer(job.scene, job.grid, lambda blank: file.lay_out(blank.with_attrs(**job.attrs)))
+            extra = self.fill(job, buffer, work, progress, reused)
+            buffer.lay_out()
+            file.finish(out, wall_time_s=work.elapsed, **extra)
+
+
+DIRECT = Route()

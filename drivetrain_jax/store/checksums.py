@@ -18,7 +18,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._machine import usable_cores
-from drivetrain_jax.store.reading import opened
+from drivetrain_jax.store.netcdf import opened
 
 ATTRIBUTE = "checksums"
 # The name of the root group stands for the attributes of the file.

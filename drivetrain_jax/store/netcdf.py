@@ -6,12 +6,15 @@ https://docs.unidata.ucar.edu/netcdf-c/current/file_format_specifications.html
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, cast
 
 import h5py
 import numpy as np
 
+from drivetrain_jax._errors import InputError
 from drivetrain_jax.store.schema import DETAILS, GROUP, Entry, Labelled
 
 _MADE_BY = f"version=2,h5py={h5py.__version__},hdf5={h5py.version.hdf5_version}"
@@ -120,3 +123,34 @@ def _aside(result: Labelled) -> dict[str, Entry]:
 
 def _coordinates(names: Sequence[str]) -> dict[str, str]:
     return {"coordinates": " ".join(names)} if names else {}
+
+
+# Exceptions of h5py for a damaged file structure.
+BROKEN = (OSError, KeyError, ValueError, RuntimeError, TypeError, OverflowError, MemoryError)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[h5py.File]:
+    """The HDF5 file at ``path``. Damage raises :class:`InputError`, found at the start or inside the context."""
+    if not path.is_file():
+        raise unreadable(path)
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except BlockingIOError:
+        message = f"file = {str(path)!r}: locked by another program; wait until that program closes it"
+        raise InputError(message) from None
+    except BROKEN as error:
+        raise unreadable(path) from error
+
+
+def unreadable(path: Path) -> InputError:
+    """The error for a path that is not a readable file."""
+    if path.suffix == ".parts":
+        return InputError(f"file = {str(path)!r}: a folder of unfinished work; give {str(path.with_suffix(''))!r}")
+    if (path / "zarr.json").is_file():
+        return InputError(f"file = {str(path)!r}: a Zarr store; give the file that `drivetrain export` makes of it")
+    what = (
+        "not a readable netCDF4/HDF5 file" if path.is_file() else "is a folder" if path.is_dir() else "does not exist"
+    )
+    return InputError(f"file = {str(path)!r}: {what}; give a result written by `drivetrain run`")

@@ -16,8 +16,8 @@ from drivetrain_jax.atlas import charts
 from drivetrain_jax.runs import kernel
 from drivetrain_jax.runs.job import Block, Job
 from drivetrain_jax.runs.resolve import resolve
-from drivetrain_jax.runs.routes import DIRECT
 from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.runs.work import DIRECT
 
 
 def test_double_precision():
