@@ -319,6 +319,8 @@ def main_of_forks() -> int:
             source = str(Path(__file__).with_name("calls.c"))
             subprocess.run(["cc", "-shared", "-fPIC", "-O1", "-o", library, source, "-ldl"], check=True)
             environment = os.environ | {"LD_PRELOAD": library, "FAULT_LIBRARY": library}
+            # Forks compile quickly.
+            environment["XLA_FLAGS"] = "--xla_backend_optimization_level=0"
             return subprocess.run([sys.executable, *sys.argv], env=environment, check=False).returncode
         records = crashes(Path(folder) / "faults", options.seed, options.every, options.kinds)
     if not options.kinds and options.every == 1:

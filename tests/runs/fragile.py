@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
 import os
 import signal
 from pathlib import Path
@@ -22,19 +21,6 @@ def _perhaps_die(deadly: np.ndarray, folder: str) -> np.ndarray:
         once.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return np.zeros(np.shape(deadly))
-
-
-def _perhaps_die_at_start() -> None:
-    """Kill a spawned process at its start, the first ``FRAGILE_AT_START`` times."""
-    if multiprocessing.parent_process() is not None:
-        starts = Path(os.environ["FRAGILE_FOLDER"]) / "starts"
-        count = len(starts.read_text()) if starts.exists() else 0
-        starts.write_text("x" * (count + 1))
-        if count < int(os.environ.get("FRAGILE_AT_START", "0")):
-            os.kill(os.getpid(), signal.SIGKILL)
-
-
-_perhaps_die_at_start()
 
 
 class Fragile(System):
@@ -66,8 +52,8 @@ class Fragile(System):
             2 * math.pi,
             log_determinant=lambda: -0.04 * math.pi + 0 * self.delta,
         )
-        return FloquetModel(system, system, self.steps)
+        return FloquetModel(system, system, panels=self.steps)
 
     def steps(self, rtol):
         """The effort keeps deadly points in chunks of their own."""
-        return 30 + 10 * (self.deadly + 0 * self.delta)
+        return 8 + 8 * (self.deadly + 0 * self.delta)
