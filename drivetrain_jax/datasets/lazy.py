@@ -22,9 +22,6 @@ from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.atlas_file import StoredAtlas, open_atlas
 from drivetrain_jax.runs.physical import in_parameters
 
-# The grid on which an atlas is opened: values of each of its parameters, from the option ``grid``.
-
-
 # Number of values of a parameter that the grid does not name.
 _DEFAULT = 512
 _ALLOWED = "a number of values (1000), (START, STOP, NUM), a row of values, or one value (0.5)"
