@@ -199,14 +199,45 @@ STEADY_STATE = Declared(
 )
 
 
+# Excess of a spectral radius over 1 up to which an orbit may be called stable.
+_MARGIN = 2e-8
+
+
+def _branches_fall(ds: xr.Dataset) -> xr.DataArray:
+    amplitude = ds["branch_amplitude"]
+    own = [dim for dim in amplitude.dims if dim != "branch" and dim not in ds["outcome"].dims]
+    return amplitude.max(own).diff("branch") < -ROUNDING * amplitude.max([*own, "branch"])
+
+
+def _stability_differs(ds: xr.Dataset) -> xr.DataArray:
+    stability, radius = ds["branch_stability"], ds["branch_spectral_radius"]
+    wrong = ((stability == 0) & (radius > 1 + _MARGIN)) | ((stability == 1) & (radius <= 1))
+    return wrong | ((stability == 2) != radius.isnull())
+
+
 FREQUENCY_RESPONSE = Declared(
-    (*MOTION, in_order("branch_u_min", "branch_u_max"), ordered("fold_frequency", "fold")),
+    (
+        *MOTION,
+        in_order("branch_u_min", "branch_u_max"),
+        within("branch_amplitude", 0.0),
+        within("branch_spectral_radius", 0.0),
+        relation("largest branch_amplitude rises along branch", ("branch_amplitude", "outcome"), _branches_fall),
+        relation(
+            "branch_stability follows from branch_spectral_radius",
+            ("branch_stability", "branch_spectral_radius"),
+            _stability_differs,
+        ),
+        ordered("fold_frequency", "fold"),
+        ordered("doubling_frequency", "doubling"),
+    ),
     # NaN is allowed: the dimensions of branches and folds are longer than most points need, a motion at rest has no phase,
     # and some frequencies have no backbone.
     gaps=(
         "phase",
         "branch_u_max",
         "branch_u_min",
+        "branch_amplitude",
+        "branch_spectral_radius",
         "fold_frequency",
         "doubling_frequency",
         "backbone_amplitude",

@@ -109,6 +109,22 @@ def test_the_first_wrong_point_is_named(chart):
             "sum of basin_fraction over attractor + unsettled_fraction = 1",
         ),
         ("forced", {"condition": real([0.5])}, "1 <= condition"),
+        (
+            "frequency_response",
+            {"branch_amplitude": real([[[0.1, 0.3], [0.2, 0.1]]], "branch", "shaft")},
+            "largest branch_amplitude rises along branch",
+        ),
+        *(
+            (
+                "frequency_response",
+                {
+                    "branch_stability": ("branch", np.array([code], np.int8)),
+                    "branch_spectral_radius": ("branch", np.array([radius])),
+                },
+                "branch_stability follows from branch_spectral_radius",
+            )
+            for code, radius in ((0, 1.1), (1, 0.9), (2, 0.5), (0, np.nan))
+        ),
     ],
 )
 def test_rules_of_the_analyses(analysis, variables, rule):
@@ -129,6 +145,7 @@ def test_rules_of_the_analyses(analysis, variables, rule):
         ("lyapunov", 1, {"lyapunov_spectrum": real([[0.2]], "exponent"), "sum_rule_residual": real([5.0])}),
         ("lyapunov", 0, {"lyapunov_spectrum": real([[0.0]], "exponent"), "sum_rule_residual": real([1e-18])}),
         ("floquet", 3, {"floquet_multiplier": real(np.empty((1, 0)), "multiplier")}),
+        ("frequency_response", 0, {"branch_amplitude": real([[[0.1, 0.3], [np.nan, np.nan]]], "branch", "shaft")}),
     ],
 )
 def test_what_may_be_missing_or_kept_breaks_nothing(analysis, outcome, variables):

@@ -19,7 +19,7 @@ from jax import Array
 
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.analysis._base import Outcome, Request, Solver
-from drivetrain_jax.analysis.forced.analysis import SAME, STABLE_MARGIN, distinct, orbits_near
+from drivetrain_jax.analysis.forced.analysis import NEAR, SAME, STABLE_MARGIN, distinct, orbits_near
 from drivetrain_jax.analysis.forced.coexisting import REACH, speed_map
 from drivetrain_jax.analysis.impacts.motion import ABSENT, STABILITY, STABLE, UNSTABLE
 from drivetrain_jax.analysis.numerics.branch_sections import course, sections
@@ -32,8 +32,6 @@ BRANCHES, _SPECIAL = 7, 16
 _SPACING, _STARTS, _ATTEMPTS, _LONGEST, _RTOL = 1.15, 48, 150, 0.06, 1e-9
 # Positions of one branch at a speed, folds and doublings of each kind on one branch, most steps of an integration.
 _EACH, _EACH_SPECIAL, _STEPS = 3, 4, 4096
-# Difference of states relative to their size below which two approximate orbits are one.
-_NEAR = 1e-3
 
 
 def variables(system: type[System]) -> tuple[Variable, ...]:
@@ -128,7 +126,7 @@ def _branches(model_at: Any, rising: np.ndarray, n: int, special: bool) -> tuple
     def positions(value: Array) -> tuple[Array, Array]:
         guess, exists, every = sections(along, value, _EACH)
         y = jnp.where(exists[:, None], guess, jnp.nan)[:, :n].transpose(0, 2, 1).reshape(-1, n)
-        new = distinct(y, _NEAR)
+        new = distinct(y, NEAR)
         first = jnp.argsort(~new)[:BRANCHES]
         return jnp.where(new[first][:, None], y[first], jnp.nan), jnp.all(every) & (jnp.sum(new) <= BRANCHES)
 
