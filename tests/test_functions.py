@@ -330,12 +330,6 @@ def test_fixed_values_may_be_numbers_of_numpy_and_jax(number):
     assert found.spectral_radius[0] == pytest.approx(float(dt.floquet(shaft).spectral_radius), rel=1e-12)
 
 
-def test_a_point_without_result_is_not_stable():
-    """Its verdict is undecided: the code 0 would say that it is stable."""
-    lost = dt.floquet(dt.Cardan(beta=0.3, Omega=1e-300, zeta=0.1, alpha=1.0, mu=1.0, gamma=1e9), method="direct")
-    assert lost.outcome == Outcome.STEP_LIMIT and np.isnan(lost.spectral_radius) and lost.verdict == 2
-
-
 @pytest.mark.parametrize("name", ["k[1]", "l[1]"])
 def test_a_swept_entry_keeps_its_array_or_list(name):
     """Also an array of integers, whose type does not hold the value."""

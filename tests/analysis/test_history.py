@@ -80,10 +80,9 @@ def test_one_bad_lane_is_an_outcome_and_spoils_no_other(histories):
     names = histories.outcome.attrs["flag_meanings"].split()
     assert [names[i] for i in histories.outcome.values] == ["success", "not_finite", "success", "success"]
     assert np.isnan(histories.phi[ENDS, 1:]).all()
-    alone = dt.run(
-        scene({"times": list(TIMES), "rtol": 1e-9}, points={name: values[LARGE:] for name, values in POINTS.items()})
-    )
-    np.testing.assert_allclose(alone.phi, histories.phi[LARGE:], rtol=1e-9, atol=1e-15)
+    good = {name: values[LARGE:] * 2 for name, values in POINTS.items()}
+    alone = dt.run(scene({"times": list(TIMES), "rtol": 1e-9}, points=good))
+    np.testing.assert_allclose(alone.phi[:2], histories.phi[LARGE:], rtol=1e-9, atol=1e-15)
 
 
 LONG = {"element": "input", "equation": "29", "beta": 0.157, "zeta": 1e-9, "chi_n": 0.0, "M_AEM": 0.0}

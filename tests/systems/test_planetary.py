@@ -57,7 +57,7 @@ def test_planets_in_one_place_are_warned_of(angles):
 def test_the_vector_field_is_that_of_the_equations_of_motion(model):
     gear = dt.Planetary(planet_angle=(0.0, 1.3, 3.3), **LISTS, **HELD, k_sx=2e8, model=model)
     dofs = len(gear.springs().dofs)
-    slopes = np.asarray(jax.jacfwd(lambda y: gear.vector_field(0.3, y))(np.ones(2 * dofs)))
+    slopes = np.asarray(jax.jit(jax.jacfwd(lambda y: gear.vector_field(0.3, y)))(np.ones(2 * dofs)))
     assert np.array_equal(slopes[:dofs], np.eye(2 * dofs)[dofs:]) and not slopes[dofs:, dofs:].any()
     squares = np.sort(np.linalg.eigvals(-slopes[dofs:, :dofs]).real)
     assert np.sqrt(np.abs(squares)) / (2 * math.pi) == pytest.approx(frequencies(gear), rel=1e-9, abs=1e-3)
@@ -66,7 +66,7 @@ def test_the_vector_field_is_that_of_the_equations_of_motion(model):
         mass, stiffness = (np.array(x, float) for x in matrices(TABLE_2 | plain.values))
         y = np.random.default_rng(0).normal(size=2 * dofs)
         expected = np.concatenate([y[dofs:], -(stiffness @ y[:dofs]) / mass])
-        assert np.asarray(plain.vector_field(0.0, y)) == pytest.approx(expected, rel=1e-12)
+        assert np.asarray(jax.jit(plain.vector_field)(0.0, y)) == pytest.approx(expected, rel=1e-12)
 
 
 def test_rotations_of_four_planets():

@@ -28,16 +28,6 @@ def test_second_clause_of_the_criterion_drops_most_cells():
     assert 0.6 < dropped < 0.8
 
 
-def test_damping_destabilises():
-    zetas = [0.0, 0.001, 0.01]
-    points = {"beta": [1.14] * 3, "Omega": [0.6695] * 3, "zeta": zetas}
-    fixed = {"alpha": 1.0, "mu": 1.0, "gamma": 100.0}
-    outputs = ["spectral_radius", "verdict"]
-    ds = dt.run({"system": "cardan", "analysis": "floquet", "outputs": outputs, "points": points, "fixed": fixed})
-    assert ds.verdict.values.tolist() == [0, 1, 1]
-    np.testing.assert_allclose(ds.spectral_radius, [1.0, 1.0000035, 1.00003], atol=3e-6)
-
-
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("beta", "Omega", "about_orbit"),
