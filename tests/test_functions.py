@@ -177,7 +177,9 @@ def test_diffrax_under_vmap_is_the_engine(monkeypatch, analysis):
     else:
         calls, original = [], diffrax.diffeqsolve
         monkeypatch.setattr(propagator.diffrax, "diffeqsolve", lambda *a, **k: calls.append(1) or original(*a, **k))
+        # What another test has traced is not traced again.
         kernel._compiled.cache_clear()
+        jax.clear_caches()
         dt.run({"system": "cardan", "analysis": "atlas", "axes": axes, "fixed": BASE})
         assert calls
 
