@@ -325,11 +325,6 @@ def test_a_state_alone_has_the_derivatives_that_it_has_with_its_amplitude():
         np.testing.assert_allclose(getattr(alone, name), getattr(found, name)[:4], rtol=1e-7, atol=1e-9)
 
 
-@pytest.mark.full
-def test_both_modes_agree():
-    check_grads(floquet_radius, (SHAFT,), order=1, modes=("fwd", "rev"), eps=1e-5)
-
-
 def test_where_there_is_no_derivative_there_is_none():
     """All multipliers are on the unit circle."""
     undamped = dt.Cardan(beta=0.3, Omega=1.2, zeta=0.0, alpha=1.0, mu=1.0, gamma=100.0)

@@ -184,13 +184,6 @@ def test_diffrax_under_vmap_is_the_engine(monkeypatch, analysis):
         assert calls
 
 
-@pytest.mark.full
-def test_diffrax_under_vmap_is_the_engine_of_the_tripod(monkeypatch):
-    axes = {"beta": {"start": 0.1, "stop": 0.2, "num": 8}}
-    scene = {"system": "tripod", "analysis": "floquet", "axes": axes, "fixed": {"element": "input", "zeta": 0.01}}
-    assert calls_of_diffeqsolve(monkeypatch, scene)[0]
-
-
 def swept(function, over=None, **options):
     """A sweep of ``function`` over entries of a dict, by default of ``a``."""
     return dt.sweep(

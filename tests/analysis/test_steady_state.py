@@ -136,13 +136,6 @@ def test_the_exponent_of_chaos_is_the_mean_growth_of_a_tangent():
     assert found["lyapunov_exponent"].item() == pytest.approx(mean, rel=3e-3)
 
 
-def test_what_is_said_of_chaos_leaves_room_for_a_transient():
-    """No finite time distinguishes a chaotic transient from an attractor."""
-    said = {variable.name: variable.long_name for variable in ANALYSIS.variables}
-    assert "not periodic within most_periods" in said["period_multiple"]
-    assert "possibly a transient" in said["regime"]
-
-
 def test_a_lane_alone_is_the_lane_in_its_batch(steady):
     cases = from_orbits()[:12]
     together, alone = steady(cases), steady(cases[4:5])

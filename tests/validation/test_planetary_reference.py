@@ -57,8 +57,7 @@ def spectrum(name: str):
 
 # Cases by number of planets, which need a kernel each: the short form has one number.
 NAMES = [
-    pytest.param(name, marks=() if len(case["psi_deg"]) == 4 else pytest.mark.full)
-    for name, case in CASES.items()
+    pytest.param(name, marks=() if len(case["psi_deg"]) == 4 else pytest.mark.full) for name, case in CASES.items()
 ]
 
 
