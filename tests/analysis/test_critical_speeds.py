@@ -78,6 +78,7 @@ def test_reference_values(solved, name):
     assert error.max() <= 1e-13
 
 
+@pytest.mark.full
 def test_mode_60_of_closed_forms():
     """Pinned ends: z = n pi. Free ends: cos z ch z = 1, from n = 20 on z = (n + 1/2) pi to the last digit."""
     shafts = Shaft(

@@ -75,6 +75,7 @@ def test_the_acceleration_is_that_of_the_vector_field():
     np.testing.assert_array_equal([r[0] for r in rates], found.v)
 
 
+@pytest.mark.full
 def test_requested_times_do_not_change_the_motion():
     """The state after a hundred periods is the same up to rounding, even if times coincide with ends of drive periods."""
     period = 2 * math.pi / 0.86

@@ -100,10 +100,6 @@ def check_modes(names: list[str], method: str) -> None:
         np.testing.assert_allclose(ds.participation.values[i].sum(-1), 1, atol=1e-12)
 
 
-def test_types_and_frequencies_from_vectors():
-    check_modes(by_count()[4], "auto")
-
-
 @pytest.mark.full
 @pytest.mark.parametrize("method", ["auto", "full"])
 @pytest.mark.parametrize("count", by_count())
