@@ -37,10 +37,11 @@ def random_angles(rng: np.random.Generator, count: int, n: int) -> np.ndarray:
     return np.sort(rng.uniform(0, 2 * math.pi, (count, n)), axis=1)
 
 
-@pytest.mark.parametrize("n", [n if n == 5 else pytest.param(n, marks=pytest.mark.full) for n in range(3, 13)])
+@pytest.mark.full
+@pytest.mark.parametrize("n", range(3, 13))
 def test_random_spacings_have_the_right_count_of_planet_modes(n):
     """There are three planet modes N - 3 times and one rigid rotation."""
-    count = 29
+    count = 30
     ds = run_angles(random_angles(np.random.default_rng(n), count, n), MODES)
     types, frequency = ds.mode_type.values, ds.natural_frequency.values
     assert ((types == PLANET).sum(1) == 3 * (n - 3)).all()
@@ -66,12 +67,11 @@ def test_labels_of_five_planets():
     angles = (spacings[:, None] + shifts).reshape(-1, 5)
     c1 = np.abs(np.exp(1j * angles).mean(1))
     assert (c1 < SYMMETRIC).all() and c1.max() > 1e-11
-    # As many points as above, so that they share a kernel.
-    ds = run_angles(np.concatenate([spacings, angles, [unequal] * 3]), MODES)
+    ds = run_angles(np.concatenate([spacings, angles, [unequal]]), MODES)
     types, frequency = ds.mode_type.values, ds.natural_frequency.values
     counts = [[(row == kind).sum() for kind in range(5)] for row in types]
-    assert counts[:-3] == [[1, 5, 12, 6, 0]] * 26
-    for first, rest in zip(types[:2], types[2:-3].reshape(2, 12, -1), strict=True):
+    assert counts[:-1] == [[1, 5, 12, 6, 0]] * 26
+    for first, rest in zip(types[:2], types[2:-1].reshape(2, 12, -1), strict=True):
         assert (rest == first).all()
     assert counts[-1][COUPLED] == 17 and not counts[-1][ROTATIONAL] and not counts[-1][TRANSLATIONAL]
     rotational = [frequency[i][types[i] == ROTATIONAL] for i in (0, 1)]
