@@ -20,8 +20,7 @@ from drivetrain_jax.report.statements import amplitudes, statements
 from drivetrain_jax.report.tables import Table, axes_table, fixed_table, values_tables
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.consolidate import open_result
-from drivetrain_jax.view.prefixes import with_prefixes
-from drivetrain_jax.view.units import in_given_units, in_units, listed, written_units
+from drivetrain_jax.view.units import in_given_units, in_units, listed, with_prefixes, written_units
 
 # Cells each way of the chart of an atlas, whose figure is a vector image, and cells of an atlas of one parameter: ranges of
 # instability are narrow.

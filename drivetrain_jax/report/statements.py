@@ -16,7 +16,7 @@ import xarray as xr
 
 from drivetrain_jax.report.tables import coordinates, digits, flag_words, value_text
 from drivetrain_jax.resonances import FREQUENCIES, operating_range, stored_orders
-from drivetrain_jax.view.cells import role
+from drivetrain_jax.view.charts import role
 from drivetrain_jax.view.style import scene_key, units_of
 from drivetrain_jax.view.units import ASKED, size, suitable, value_in
 

@@ -40,9 +40,9 @@ __all__ = ["plot"]
 def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     """The figure of the analysis of ``dataset`` (attribute ``analysis``), for example a stability chart.
 
-    ``others`` are results of the same analysis by other methods, drawn into the same axes (``frequency_response``). Save
-    the figure with ``figure.savefig(path)``. Raises :class:`InputError` for an analysis without a figure, for a result
-    without values to plot, and for results that cannot share a figure.
+    ``others`` are results of the same analysis by other methods, drawn into the same axes (``frequency_response``). Axes of
+    one value count as fixed. Save the figure with ``figure.savefig(path)``. Raises :class:`InputError` for an analysis
+    without a figure, for a result without values to plot, and for results that cannot share a figure.
     """
     analysis = dataset.attrs.get("analysis")
     if analysis == "atlas":
@@ -57,7 +57,15 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
             raise InputError(
                 f"analysis = {other.attrs.get('analysis')!r}: allowed is the analysis of the first result, {analysis}"
             )
-    return import_module(f"drivetrain_jax.analysis.{analysis}.figure").plot(dataset, *others)
+    # Local imports: matplotlib takes long, and results without a figure need none.
+    import matplotlib
+
+    from drivetrain_jax.view.charts import prepare
+    from drivetrain_jax.view.style import STYLE
+
+    module = import_module(f"drivetrain_jax.analysis.{analysis}.figure")
+    with matplotlib.rc_context(STYLE):
+        return module.plot(*(prepare(each) for each in (dataset, *others)))
 
 
 def _plot_of_plugin(analysis: str, dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
@@ -69,7 +77,6 @@ def _plot_of_plugin(analysis: str, dataset: xr.Dataset, *others: xr.Dataset) -> 
     if found is None:
         known = ", ".join((*_DRAWN, *plugin_names(FIGURES)))
         raise InputError(f"analysis = {analysis!r}: has no figure; allowed is one of {known}")
-    # Local import: matplotlib takes long, and results without a figure need none.
     from matplotlib.figure import Figure
 
     allowed = "a matplotlib Figure"

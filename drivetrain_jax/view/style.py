@@ -8,10 +8,8 @@ import tomllib
 from typing import Any
 
 import xarray as xr
-from matplotlib.colors import ListedColormap
 
-from drivetrain_jax.view.prefixes import prefixed
-from drivetrain_jax.view.units import SUPERSCRIPTS, unit_of, value_in, written_units
+from drivetrain_jax.view.units import SUPERSCRIPTS, prefixed, unit_of, value_in, written_units
 
 # Passed to rc_context around every figure; global rcParams stay unchanged.
 STYLE: dict[Any, Any] = {
@@ -36,17 +34,27 @@ STYLE: dict[Any, Any] = {
     "hatch.linewidth": 0.5,
 }
 
-# The lightness of the four colours is 100, 27, 76, 50, so that the states differ in grey.
-STATE_NAMES = ("stable", "unstable", "undecided", "failed")
-STATE_COLOURS = ("#ffffff", "#33415c", "#f2b632", "#d1495b")
-STATE_HATCHES = ("", "", "////", "xxxx")
-STATES = ListedColormap(STATE_COLOURS, name="states")
-
-LINE_COLOURS = ("#1f4e79", "#d1771e")
+LINE_COLOURS = ("#1f4e79", "#d1771e", "#3f8f5f", "#7a4fa0", "#999933", "#333333", "#a0308c")
 # Attractors differ in lightness and hue.
 ATTRACTOR_COLOURS = ("#33517c", "#f2b632", "#9cc3e0", "#c8553d", "#6a994e", "#d9c5e0", "#2d0a2b", "#8d99ae")
-FRAME_GREY = "#555555"
-PREDICTION = "#0b84d8"
+FRAME_GREY, PREDICTION = "#555555", "#0b84d8"
+# Lightness falls from stable or regular to unstable or irregular, so that flags differ in grey. Stable cells are
+# transparent: lines below the cells show there alone.
+FLAG_COLOURS = {
+    "stable": "#ffffff00",
+    "unstable": "#33415c",
+    "undecided": "#f2b632",
+    "no_separation": "#ffffff00",
+    "single_sided": "#9cc3e0",
+    "double_sided": "#33517c",
+    "non_periodic": "#f2b632",
+    "fixed_point": "#e6f0f7",
+    "periodic": "#b5d3ea",
+    "quasi_periodic": "#6ea6d0",
+    "parametrically_unstable": "#d1771e",
+    "chaotic": "#5b1020",
+}
+FAILED_COLOUR, PENDING_COLOUR = "#d1495b", "#c4c4c4"
 
 _GREEK = {
     *("alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "kappa", "lambda", "mu", "nu", "xi"),
@@ -55,7 +63,7 @@ _GREEK = {
 
 # Largest length of a list in a caption.
 _MOST_ENTRIES = 6
-_PRODUCTS = {"EI": "$EI$", "rhoA": r"$\rho A$", "rhoI": r"$\rho I$", "kGA": r"$\kappa GA$"}
+_PRODUCTS = {"EI": "$EI$", "rhoA": r"$\rho{}A$", "rhoI": r"$\rho{}I$", "kGA": r"$\kappa{}GA$"}
 
 
 def symbol(name: str) -> str:

@@ -6,6 +6,8 @@ import json
 
 import numpy as np
 import xarray as xr
+from matplotlib.collections import QuadMesh
+from matplotlib.text import Text
 
 LONG_NAMES = {"beta": "joint angle", "Omega": "speed", "mu": "stiffness ratio", "alpha": "damping ratio"}
 UNITS = {"beta": "rad"}
@@ -17,6 +19,24 @@ FAMILIES = {
     "C": {"name": "sum combination $C^+$", "line": "dashdot"},
     "C-": {"name": "difference combination", "drawn": False},
 }
+
+
+def panels(figure) -> list:
+    """Axes of ``figure`` without colour bars."""
+    return [axes for axes in figure.axes if axes.get_label() != "<colorbar>"]
+
+
+def meshes(figure) -> list[QuadMesh]:
+    return [artist for axes in panels(figure) for artist in axes.collections if isinstance(artist, QuadMesh)]
+
+
+def texts(figure) -> list[str]:
+    """All texts of ``figure`` on one line each."""
+    return [text.get_text().strip().replace("\n", " ").replace("\u00a0", " ") for text in figure.findobj(Text)]
+
+
+def legend(figure) -> list[str]:
+    return [text.get_text() for box in figure.legends for text in box.get_texts()]
 
 
 def unstable(beta: float | np.ndarray, omega: float | np.ndarray) -> np.ndarray:
@@ -32,7 +52,11 @@ def grid(values: np.ndarray, *names: str) -> xr.Dataset:
     data = {
         "spectral_radius": (names, radius, {"units": "1", "long_name": "spectral radius of the monodromy matrix"}),
         "spectral_radius_error": (names, np.full(code.shape, 1e-3), {"units": "1", "long_name": "bound of its error"}),
-        "verdict": (names, verdict, {"units": "1", "long_name": "verdict"}),
+        "verdict": (
+            names,
+            verdict,
+            {"units": "1", "long_name": "verdict", "flag_meanings": "stable unstable undecided"},
+        ),
         "outcome": (names, np.where(code == 3, 2, 0).astype("int8"), {"units": "1", "long_name": "outcome"}),
     }
     attrs = {"analysis": "floquet", "title": "A tongue", "fixed_parameters": json.dumps(FIXED), "roles": ROLES}

@@ -2,30 +2,15 @@
 
 from __future__ import annotations
 
-import matplotlib
 import numpy as np
 import pytest
 import xarray as xr
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from drivetrain_jax.view import cells, plot
-from drivetrain_jax.view.figure_layout import Panels, write_title
-from drivetrain_jax.view.style import STYLE, axis_label, caption, value_text, variable_label
+from drivetrain_jax.view import charts, plot, sheet
+from drivetrain_jax.view.style import axis_label, caption, value_text, variable_label
 from tests.view import results
-from tests.view.test_stability import meshes, panels
-
-
-def test_edges_of_uniform_cells():
-    np.testing.assert_allclose(cells.cell_edges(np.array([0.0, 0.1, 0.2])), [-0.05, 0.05, 0.15, 0.25])
-
-
-def test_edges_of_logarithmic_cells_are_geometric_means():
-    np.testing.assert_allclose(cells.cell_edges(np.array([1.0, 10.0, 100.0])), 10.0 ** np.array([-0.5, 0.5, 1.5, 2.5]))
-
-
-def test_edges_of_irregular_cells():
-    np.testing.assert_allclose(cells.cell_edges(np.array([0.0, 1.0, 3.0])), [-0.5, 0.5, 2.0, 4.0])
+from tests.view.results import meshes, panels
 
 
 @pytest.mark.parametrize(
@@ -38,7 +23,7 @@ def test_edges_of_irregular_cells():
     ],
 )
 def test_logarithmic_axes_are_recognised(values, logarithmic):
-    assert cells.is_logarithmic(np.asarray(values, float)) is logarithmic
+    assert sheet.is_logarithmic(np.asarray(values, float)) is logarithmic
 
 
 def test_drawn_cells_have_these_edges_and_this_scale():
@@ -67,23 +52,23 @@ def test_cells_still_to_be_computed_are_not_failed():
     chart = results.with_axes(results.grid(codes, "beta", "Omega"), beta=np.arange(2.0), Omega=np.arange(3.0))
     chart["outcome"] = chart["outcome"].assign_attrs(flag_values=np.arange(7), flag_meanings="a b c d e f pending")
     chart["outcome"][1, 0] = 6
-    chart = cells.prepare(chart)
-    labels = [patch.get_label() for patch in cells.state_legend(chart)]
-    assert labels == ["stable", "unstable", "failed (1)", "pending (1)"]
-    figure = Figure()
-    axes = figure.add_subplot()
-    cells.draw_states(axes, chart, "Omega", "beta")
-    _, over = axes.collections
-    np.testing.assert_array_equal(np.ma.filled(over.get_array(), np.nan), [[np.nan] * 3, [0, np.nan, np.nan]])
+    chart = charts.prepare(chart)
+    assert [patch.get_label() for patch in charts.flag_entries(charts.valid(chart, "verdict"))] == [
+        *("stable (2)", "unstable (2)", "failed (1)", "pending (1)")
+    ]
+    np.testing.assert_array_equal(charts.valid(chart, "verdict"), [[0, 1, 3], [4, 0, 1]])
+    over = charts.draw_cells(axes := Figure().add_subplot(), chart["spectral_radius"], "Omega", "beta")
+    assert axes.collections[1] is not over
+    covered = np.ma.filled(axes.collections[1].get_array(), np.nan)
+    np.testing.assert_array_equal(covered, [[np.nan] * 3, [0, np.nan, np.nan]])
 
 
 def test_a_strip_shows_what_is_still_to_be_computed():
     line = results.with_axes(results.grid(np.array([0, 1, 0]), "Omega"), Omega=np.arange(3.0))
     line["outcome"] = line["outcome"].assign_attrs(flag_values=np.arange(7), flag_meanings="a b c d e f pending")
     line["outcome"][1] = 6
-    strip, over = meshes(plot(line))
-    np.testing.assert_array_equal(np.ma.filled(over.get_array(), np.nan), [[np.nan, 0, np.nan]])
-    assert strip.get_array().shape == (1, 3)
+    (strip,) = meshes(plot(line))
+    np.testing.assert_array_equal(strip.get_array(), [[0, 4, 0]])
 
 
 @pytest.mark.parametrize(
@@ -97,17 +82,14 @@ def test_a_strip_shows_what_is_still_to_be_computed():
     ],
 )
 def test_a_title_needs_no_paper(title, text):
-    figure = Panels(height=2.0).figure
-    write_title(figure, xr.Dataset(attrs={"title": title}), 0.75)
-    assert figure.texts[0].get_text() == text
+    assert sheet.shown_title(xr.Dataset(attrs={"title": title})) == text
 
 
 @pytest.mark.parametrize("text", [r"Cost $\foo$ of a gear", r"From $5 to $6_{", r"A \$ and $\beta$ " + "W" * 300])
 def test_a_title_is_text_and_no_formula(text):
-    figure = Panels(height=2.0).figure
-    write_title(figure, xr.Dataset(attrs={"title": text}), 0.75)
-    FigureCanvasAgg(figure).draw()
-    assert figure.texts[0].get_text()[:20] == text[:20] and not figure.texts[0].get_parse_math()
+    figure = sheet.Sheet(height=2.0).finish(xr.Dataset(attrs={"title": text}))
+    figure.draw_without_rendering()
+    assert figure.get_suptitle()[:20] == text[:20]
 
 
 def test_caption_gives_parameters_instead_of_the_point_number():
@@ -141,7 +123,7 @@ def test_axes_and_results_have_prefixes_together_with_their_numbers():
     coords |= {f"boundary_{name}": ("boundary", [2e3, np.nan], about) for name in ("k_A", "k_C")}
     torque = ("k_A", "k_B"), np.array([[0.0], [2e3], [np.nan]]), {"units": "N m", "long_name": "torque"}
     data = {"torque": torque, "outcome": (("k_A", "k_B"), np.zeros((3, 1), "int8"))}
-    shown = cells.prepare(xr.Dataset(data, coords))
+    shown = charts.prepare(xr.Dataset(data, coords))
     assert shown["k_A"].values.tolist() == [10.0, 100.0, 3000.0] and shown.indexes["k_A"].tolist() == [10, 100, 3000]
     assert shown["boundary_k_A"].values[0] == 2e-3 and shown["boundary_k_C"].values[0] == 2.0
     assert axis_label(shown["k_A"]) == "stiffness ($k_{A}$) [MN/m]"
@@ -150,20 +132,10 @@ def test_axes_and_results_have_prefixes_together_with_their_numbers():
     assert caption(shown) == "$k_{B}$ = 85 MN/m"
 
 
-def test_small_and_large_numbers_have_a_power_of_ten_at_the_axis():
-    with matplotlib.rc_context(STYLE):
-        panels = Panels(2, height=1.5, share_y=False)
-        for (axes,), top in zip(panels.axes, (8e-4, 0.03), strict=True):
-            axes.set_ylim(0, top)
-        panels.figure.draw_without_rendering()
-    offsets = [axes.yaxis.get_offset_text().get_text() for (axes,) in panels.axes]
-    assert r"\times" in offsets[0] and "10^{\N{MINUS SIGN}4}" in offsets[0] and offsets[1] == ""
-
-
 def test_a_million_on_a_logarithmic_axis_is_a_power_of_ten():
     axes = Figure().add_subplot()
     axes.set(xscale="log", xlim=(1e-2, 1e6))
-    cells.plain_decades(axes, "x")
+    sheet.plain_decades(axes, "x")
     axes.figure.draw_without_rendering()
     labels = [label.get_text() for label in axes.get_xticklabels()]
     assert "$\\mathdefault{10^{6}}$" in labels and not any("e+" in label for label in labels)

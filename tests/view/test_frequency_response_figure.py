@@ -10,9 +10,10 @@ import xarray as xr
 from matplotlib.collections import QuadMesh
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.analysis.frequency_response import figure as frequency_response
-from drivetrain_jax.view import plot, regimes
+from drivetrain_jax.view import plot
+from drivetrain_jax.view.style import FLAG_COLOURS
 
+REGIMES = "no_separation single_sided double_sided non_periodic"
 OMEGA = np.linspace(0.5, 1.5, 41)
 
 
@@ -120,18 +121,18 @@ def test_map_of_two_axes():
         B1=("B1", [0.1, 0.2], {"units": "m/s2", "long_name": "amplitude of the drive"})
     )
     pair["outcome"] = (("B1", "omega"), np.zeros((2, len(OMEGA)), "int8"))
-    flags = {"flag_meanings": "no_separation single_sided double_sided non_periodic"}
+    flags = {"flag_meanings": REGIMES, "long_name": "regime"}
     pair["regime"] = xr.zeros_like(pair["u_max"], dtype="int8").assign_attrs(flags)
     figure = plot(pair)
     assert [axes.get_title() for axes in figure.axes[:2]] == ["sweep up", "sweep down"]
-    assert "no separation" in [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "no separation (164)" in [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def test_what_cannot_be_drawn_is_refused():
     with pytest.raises(InputError, match="needs u_max and u_min"):
         plot(line().drop_vars("u_min"))
     with pytest.raises(InputError, match="allowed is omega"):
-        frequency_response.plot(line().rename(omega="beta"))
+        plot(line().rename(omega="beta"))
     with pytest.raises(InputError, match=r"axes = omega \(one value\): allowed is omega of several values"):
         plot(line().isel(omega=[3]))
     with pytest.raises(InputError, match="several results"):
@@ -145,22 +146,22 @@ def test_motions_that_are_not_periodic_are_dots_and_not_unstable():
     dataset = line("exact", branches=False)
     wandering = np.stack([(OMEGA > 0.6) & (OMEGA < 0.7), np.zeros(len(OMEGA), bool)], axis=1)
     dims = ("omega", "sweep_direction")
-    dataset["regime"] = variable(dims, np.where(wandering, 3, 1).astype("int8"), "1")
+    dataset["regime"] = variable(dims, np.where(wandering, 3, 1).astype("int8"), "1", flag_meanings=REGIMES)
     dataset["stability"] = variable(dims, wandering.astype("int8"), "1")
     figure = plot(dataset)
     axes = figure.axes[0]
     assert all(np.isnan(item.get_ydata()).all() for item in lines_of(axes, "--"))
-    amber = regimes.COLOURS[regimes.NON_PERIODIC]
+    amber = FLAG_COLOURS["non_periodic"]
     dots = [item for item in axes.lines if item.get_color() == amber]
     drawn = np.concatenate([item.get_ydata() for item in dots])
     np.testing.assert_allclose(np.sort(drawn[np.isfinite(drawn)]), OMEGA[wandering[:, 0]])
-    assert {"non-periodic", "single-sided"} <= {text.get_text() for text in figure.legends[0].get_texts()}
+    assert {"not periodic", "single sided (79)"} <= {text.get_text() for text in figure.legends[0].get_texts()}
 
 
 def test_regimes_of_both_sweeps_are_strips_and_half_the_backlash_a_line():
     dataset = with_fixed(line("exact"), b=0.3)
     codes = np.stack([np.where(OMEGA < 1.2, 2, 1), np.where(OMEGA < 0.8, 2, 1)], axis=1).astype("int8")
-    dataset["regime"] = variable(("omega", "sweep_direction"), codes, "1")
+    dataset["regime"] = variable(("omega", "sweep_direction"), codes, "1", flag_meanings=REGIMES)
     axes = plot(dataset.assign_attrs(roles='{"speed": "omega", "half_play": "b"}')).axes[0]
     strips = [each.get_array().ravel().tolist() for each in axes.collections if isinstance(each, QuadMesh)]
     assert strips == [codes[:, 1].tolist(), codes[:, 0].tolist()]

@@ -11,7 +11,8 @@ import xarray as xr
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.history.figure import _thinned
 from drivetrain_jax.view import plot
-from drivetrain_jax.view.style import axis_label, symbol, value_text, written_units
+from drivetrain_jax.view.style import axis_label, value_text, written_units
+from tests.view.results import texts
 
 TIMES = np.linspace(0, 0.01, 101)
 
@@ -50,22 +51,14 @@ def test_one_history_in_four_panels():
     along = space.lines[0].get_data_3d()
     for found, expected in zip(along, (dataset.phi, dataset.velocity, TIMES), strict=True):
         np.testing.assert_array_equal(found, expected)
-    texts = [text.get_text() for text in figure.texts]
-    assert {"A twist", r"$\beta$ = 0.1", "(a)", "(b)", "(c)", "(d)"} <= set(texts)
+    assert {"A twist", r"$\beta$ = 0.1", "(a)", "(b)", "(c)", "(d)"} <= set(texts(figure))
     assert (twist.get_ylabel(), rate.get_ylabel()) == (r"$\phi$ [rad]", "$v$ [rad/s]")
-
-
-@pytest.mark.filterwarnings("error::UserWarning")
-def test_a_single_time_is_a_point():
-    figure = plot(history().isel(time=[50]))
-    assert [axes.lines[0].get_marker() for axes in figure.axes] == ["o"] * 4
-    assert all(axes.lines[0].get_marker() in ("", "None") for axes in plot(history()).axes)
 
 
 def test_an_axis_is_a_row_of_panels_for_each_value():
     figure = plot(history(zeta=[0.01, 0.02]))
     assert len(figure.axes) == 6
-    labels = [text.get_text() for axes in figure.axes for text in axes.texts]
+    labels = [title for axes in figure.axes if (title := axes.get_title())]
     assert labels == [r"$\zeta$ = 0.01", r"$\zeta$ = 0.02"]
     assert [bool(axes.get_xlabel()) for axes in figure.axes] == [False] * 3 + [True] * 3
 
@@ -75,9 +68,8 @@ def test_history_without_values_says_so():
     for name in ("phi", "velocity"):
         dataset[name][1] = np.nan
     figure = plot(dataset)
-    texts = [[text.get_text() for text in axes.texts] for axes in figure.axes]
-    assert all("no values" not in panel for panel in texts[:3])
-    assert all("no values" in panel for panel in texts[3:])
+    shown = [[text.get_text() for text in axes.texts] for axes in figure.axes]
+    assert ["no values" in panel for panel in shown] == [False] * 3 + [True] * 3
 
 
 def test_nothing_to_plot_is_an_input_error():
@@ -87,24 +79,6 @@ def test_nothing_to_plot_is_an_input_error():
         plot(history(zeta=np.linspace(0, 1, 9).tolist()))
     with pytest.raises(InputError, match="axes = zeta, beta: allowed is one axis"):
         plot(history(zeta=[0.1, 0.2], beta=[0.1, 0.2]))
-
-
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [
-        ("phi0", r"$\phi_{0}$"),
-        ("zeta1", r"$\zeta_{1}$"),
-        ("chi_n", r"$\chi_{n}$"),
-        ("k_A", "$k_{A}$"),
-        ("B0", "$B_{0}$"),
-        ("m_p[1]", "$m_{p,1}$"),
-        ("EI[0]", "$EI_{0}$"),
-        ("m_joint[1]", r"$m_{\mathrm{joint},1}$"),
-        ("planet_angle[1]", "planet angle[1]"),
-    ],
-)
-def test_greek_letters_with_an_index(name, text):
-    assert symbol(name) == text
 
 
 @pytest.mark.parametrize(

@@ -12,27 +12,11 @@ from matplotlib.collections import PolyCollection, QuadMesh
 from matplotlib.colors import to_hex
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.view import cells, plot
-from drivetrain_jax.view.style import STATE_COLOURS
+from drivetrain_jax.view import plot
+from drivetrain_jax.view.style import FAILED_COLOUR, FLAG_COLOURS
 from tests.sizes import full_after
 from tests.view import results
-
-
-def meshes(figure) -> list[QuadMesh]:
-    return [artist for axes in panels(figure) for artist in axes.collections if isinstance(artist, QuadMesh)]
-
-
-def panels(figure) -> list:
-    """Axes of ``figure`` without colour bars."""
-    return [axes for axes in figure.axes if axes.get_label() != "colour bar"]
-
-
-def texts(figure) -> list[str]:
-    return [text.get_text().replace("\n", " ") for text in figure.texts]
-
-
-def legend(figure) -> list[str]:
-    return [text.get_text() for text in figure.legends[0].get_texts()]
+from tests.view.results import legend, meshes, panels, texts
 
 
 def test_chart_draws_every_cell_in_its_state():
@@ -43,17 +27,11 @@ def test_chart_draws_every_cell_in_its_state():
     expected = results.unstable(beta[:, None], omega[None]).sum()
     assert drawn.shape == (21, 41)
     assert [(drawn == code).sum() for code in range(4)] == [21 * 41 - expected - 3, expected, 2, 1]
-    colours = meshes(figure)[0].to_rgba(np.arange(4.0))
-    assert tuple(to_hex(colour) for colour in colours) == STATE_COLOURS
-
-
-def test_speed_is_horizontal_whatever_the_order_of_the_axes():
-    straight, swapped = (
-        plot(results.chart().transpose(*order, ...)) for order in (("beta", "Omega"), ("Omega", "beta"))
+    colours = [to_hex(colour, keep_alpha=True) for colour in meshes(figure)[0].to_rgba(np.arange(4.0))]
+    assert colours[0] == FLAG_COLOURS["stable"] and colours[3] == f"{FAILED_COLOUR}ff"
+    assert {"A tongue", r"$\zeta$ = 0.001, $\gamma$ = 100", "speed ($\\Omega$)", "joint angle ($\\beta$) [rad]"} <= set(
+        texts(figure)
     )
-    np.testing.assert_array_equal(meshes(straight)[0].get_array(), meshes(swapped)[0].get_array())
-    assert "speed ($\\Omega$)" in texts(swapped)
-    assert "joint angle ($\\beta$) [rad]" in texts(swapped)
 
 
 @pytest.mark.parametrize("order", full_after(1, [("beta", "nu"), ("nu", "beta")]))
@@ -83,15 +61,6 @@ def test_a_radius_of_zero_is_the_fastest_decay_and_not_failed():
     assert growth[2, 3] == mesh.norm.vmin
 
 
-def test_marginal_cells_do_not_look_unstable():
-    """A radius of 1 + rounding, as without damping, has the colour of rho = 1."""
-    dataset = results.chart()
-    dataset["spectral_radius"] = xr.where(dataset.spectral_radius < 1, 1 + 1e-12, dataset.spectral_radius)
-    dataset.spectral_radius.attrs["long_name"] = "spectral radius"
-    mesh = meshes(plot(dataset))[1]
-    np.testing.assert_allclose(mesh.to_rgba(np.log10(1 + 1e-12)), mesh.to_rgba(0.0), atol=0.01)
-
-
 def test_only_stored_variables_get_a_panel():
     assert len(meshes(plot(results.chart().drop_vars("verdict")))) == 1
     assert len(meshes(plot(results.chart()[["verdict", "outcome"]]))) == 1
@@ -102,16 +71,9 @@ def test_only_stored_variables_get_a_panel():
 
 
 def test_legend_counts_what_must_not_be_overlooked():
-    assert legend(plot(results.chart()))[:4] == ["stable", "unstable", "undecided (2)", "failed (1)"]
+    assert legend(plot(results.chart()))[:4] == ["stable (586)", "unstable (272)", "undecided (2)", "failed (1)"]
     clean = results.grid(np.zeros((2, 3), int), "beta", "Omega")
-    assert legend(plot(results.with_axes(clean, beta=np.arange(2.0), Omega=np.arange(1.0, 4)))) == [
-        "stable",
-        "unstable",
-    ]
-
-
-def test_title_and_fixed_parameters():
-    assert {"A tongue", r"$\zeta$ = 0.001, $\gamma$ = 100"} <= set(texts(plot(results.chart())))
+    assert legend(plot(results.with_axes(clean, beta=np.arange(2.0), Omega=np.arange(1.0, 4)))) == ["stable (6)"]
 
 
 def test_predicted_lines_exclude_difference_combinations():
@@ -147,15 +109,7 @@ def test_one_axis_gives_radius_error_band_limit_and_verdict():
     heights = band.get_paths()[0].vertices[:, 1]
     assert (heights.min(), heights.max()) == pytest.approx((-0.011, 0.251))
     (strip,) = (artist for artist in axes.collections if isinstance(artist, QuadMesh))
-    assert (strip.get_array() == cells.UNSTABLE).sum() == code.sum()
-
-
-def test_axis_of_one_value_counts_as_fixed():
-    omega = np.linspace(0.5, 1.5, 11)
-    dataset = results.grid(np.zeros((1, 11), int), "beta", "Omega")
-    figure = plot(results.with_axes(dataset, beta=np.array([0.3]), Omega=omega))
-    assert len(panels(figure)[0].lines[0].get_xdata()) == 11
-    assert r"$\zeta$ = 0.001, $\gamma$ = 100, $\beta$ = 0.3 rad" in texts(figure)
+    assert (strip.get_array() == 1).sum() == code.sum()
 
 
 def test_four_axes_give_nine_slices():
@@ -175,7 +129,7 @@ def test_four_axes_give_nine_slices():
 
 
 def test_a_range_without_a_boundary_shows_how_far_it_is_from_one():
-    """Instead of blank panels the figure shows the spectral radius, with the axis of three values across and clear ticks."""
+    """Instead of blank panels the figure shows the spectral radius, with the axis of three values across."""
     dataset = results.grid(np.zeros((11, 8, 3), int), "speed", "zeta", "chi")
     axes = {
         "speed": np.linspace(2950, 3200, 11),
@@ -189,8 +143,6 @@ def test_a_range_without_a_boundary_shows_how_far_it_is_from_one():
     drawn = meshes(figure)[0].get_array()
     np.testing.assert_allclose(drawn, np.tile(0.99 - dataset.zeta.values, (11, 1)), rtol=1e-15)
     assert any("stable everywhere" in text for text in texts(figure))
-    low, high = panels(figure)[0].get_xlim()
-    assert all(low <= tick < high - 0.05 * (high - low) for tick in panels(figure)[0].get_xticks())
 
 
 def test_points_are_drawn_by_verdict():

@@ -8,7 +8,8 @@ from matplotlib.colors import to_hex
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.basins import figure as basins
 from drivetrain_jax.view import plot
-from drivetrain_jax.view.regimes import COLOURS
+from drivetrain_jax.view.style import FLAG_COLOURS
+from tests.view.results import legend
 
 FIXED = json.dumps({"b": {"value": 0.17, "units": "m", "long_name": "half the backlash"}})
 ROLES = json.dumps({"speed": "omega", "initial_displacement": "u0", "initial_rate": "v0", "half_play": "b"})
@@ -18,16 +19,13 @@ def result(axes, **variables):
     dims = tuple(axes)
     shape = tuple(len(values) for values in axes.values())
     data = {"outcome": (dims, np.zeros(shape, np.int8))}
-    data |= {name: (dims, np.asarray(values)) for name, values in variables.items()}
+    flags = {"regime": {"flag_meanings": "no_separation single_sided double_sided non_periodic"}}
+    data |= {name: (dims, np.asarray(values), flags.get(name, {})) for name, values in variables.items()}
     coords = {
         name: (name, np.asarray(values, float), {"units": "1", "long_name": name}) for name, values in axes.items()
     }
     attrs = {"analysis": "steady_state", "title": "a title", "fixed_parameters": FIXED, "roles": ROLES}
     return xr.Dataset(data, coords, attrs)
-
-
-def labels(figure):
-    return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def test_a_map_shows_regimes_and_the_threshold():
@@ -38,8 +36,10 @@ def test_a_map_shows_regimes_and_the_threshold():
         resonance=("resonance", ["no separation ends"]), resonance_B1=(("omega", "resonance"), [[0.15], [0.25]])
     )
     figure = plot(dataset)
-    shown = labels(figure)
-    assert {"no separation", "double-sided", "non-periodic", "failed (1)", "no separation ends"} <= set(shown)
+    shown = legend(figure)
+    assert {"no separation (1)", "double sided (2)", "non periodic (1)", "failed (1)", "no separation ends"} <= set(
+        shown
+    )
     (line,) = [line for line in figure.axes[0].lines if line.get_label() == "no separation ends"]
     np.testing.assert_allclose(line.get_ydata(), [0.15, 0.25])
 
@@ -73,13 +73,6 @@ def test_branch_keeps_its_period_and_slope_and_ends_at_two_gaps(size, multiple, 
     assert found[:, 0].tolist() == branch
 
 
-def test_slopes_are_over_the_axis_and_not_over_its_numbers():
-    size = np.array([[1.0], [1.2], [1.8]])
-    one = np.ones((3, 1), int)
-    assert basins._followed(np.array([0.0, 1.0, 4.0]), size, one > 0, one)[:, 0].tolist() == [0, 0, 0]
-    assert basins._followed(np.array([0.0, 1.0, 2.0]), size, one > 0, one)[:, 0].tolist() == [0, 0, 1]
-
-
 def basin(multiple):
     """Four values of omega with one attractor each, all of the same size."""
     size = np.full((4, 1), 0.5)
@@ -96,14 +89,7 @@ def test_basins_show_the_share_of_every_attractor():
     dataset = result(axes, u_max=high, period_multiple=np.ones((2, 3), int))
     dataset["u_max"].attrs["units"] = "m"
     figure = plot(dataset)
-    assert labels(figure) == ["period 1, largest u 0.5 m: 66.7%", "period 1, largest u 0.7 m: 33.3%"]
-
-
-def test_curves_mark_what_is_not_periodic():
-    multiple = [1, 0, 2]
-    figure = plot(result({"omega": [0.5, 1.0, 1.5]}, u_max=[1.0, 2.0, 3.0], period_multiple=multiple))
-    assert "non-periodic" in labels(figure)
-    np.testing.assert_array_equal(figure.axes[1].lines[0].get_ydata(), multiple)
+    assert legend(figure) == ["period 1, largest u 0.5 m: 66.7%", "period 1, largest u 0.7 m: 33.3%"]
 
 
 def test_curves_show_both_flanks_and_bands_of_the_regimes():
@@ -114,16 +100,18 @@ def test_curves_show_both_flanks_and_bands_of_the_regimes():
         dataset[name] = ("omega", "flank"), by_flank, {"units": "1", "long_name": name}
     dataset = dataset.assign_coords(flank=["drive", "back"])
     figure = plot(dataset)
-    named = ["u_max", "flanks", "drive flank", "back flank", "no separation", "single-sided", "double-sided"]
-    assert labels(figure) == named
+    regimes = ["no separation (1)", "single sided (1)", "double sided (1)"]
+    assert legend(figure) == ["drive flank", "back flank", "flanks", *regimes]
     extremes, *others = figure.axes
     assert sorted(line.get_ydata()[0] for line in extremes.lines if line.get_label() == "flanks") == [-0.17, 0.17]
     for axes in others:
         np.testing.assert_array_equal([line.get_ydata() for line in axes.lines], by_flank.T)
     for axes in figure.axes:
-        shown = [to_hex(band.get_facecolor()) for band in axes.patches]
-        assert shown == [COLOURS[k] for k in (1, 2, 0)]
-        assert [band.get_x() for band in axes.patches] == [0.25, 0.75, 1.25]
+        (bands,) = axes.collections
+        np.testing.assert_array_equal(bands.get_coordinates()[0, :, 0], [0.25, 0.75, 1.25, 1.75])
+        assert [to_hex(colour) for colour in bands.to_rgba([1.0, 2.0])] == [
+            FLAG_COLOURS[flag] for flag in ("single_sided", "double_sided")
+        ]
 
 
 def test_a_single_value_of_the_axis_is_said_to_be_one():
@@ -139,17 +127,4 @@ def test_a_motion_shows_history_and_phase_portrait():
     figure = plot(dataset)
     # The phase portrait is a closed curve.
     portrait = figure.axes[1].lines[0]
-    assert portrait.get_xdata()[0] == portrait.get_xdata()[-1] and "flanks" in labels(figure)
-
-
-def test_missing_variables_are_named():
-    with pytest.raises(InputError, match="u_history"):
-        plot(result({"omega": [0.5]}, u_max=[1.0]))
-
-
-def test_a_motion_without_values_is_refused():
-    empty = np.full(4, np.nan)
-    dataset = result({}, u_history=0.0, v_history=0.0)
-    dataset = dataset.assign({name: ("sample", empty) for name in ("u_history", "v_history")})
-    with pytest.raises(InputError, match="u_history = nan: nothing to plot"):
-        plot(dataset)
+    assert portrait.get_xdata()[0] == portrait.get_xdata()[-1] and "flanks" in legend(figure)

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from string import ascii_uppercase
 
-import matplotlib
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from drivetrain_jax._errors import InputError
-from drivetrain_jax.view import cells
-from drivetrain_jax.view.figure_layout import Margins, Panels
-from drivetrain_jax.view.style import ATTRACTOR_COLOURS, STYLE, axis_label, variable_label
+from drivetrain_jax.view import charts
+from drivetrain_jax.view.sheet import Sheet, fit_axis
+from drivetrain_jax.view.style import ATTRACTOR_COLOURS, axis_label, variable_label
 
 _NEEDED = ("attractor_u_max", "basin_fraction")
 # Relative change of size between neighbours of the axis within which an attractor is the same.
@@ -23,8 +20,6 @@ _LOST = 2
 # Sizes below this are motions at rest.
 _REST = 1e-300
 _MARKERS = "os^D"
-_ENTRIES, _ENTRY_HEIGHT = 6, 0.15
-_HEIGHT = 2.2
 
 
 def plot(dataset: xr.Dataset) -> Figure:
@@ -32,15 +27,33 @@ def plot(dataset: xr.Dataset) -> Figure:
 
     Raises :class:`InputError` for another number of axes, and if ``basin_fraction`` or ``attractor_u_max`` is missing.
     """
-    with matplotlib.rc_context(STYLE):
-        dataset = cells.prepare(dataset)
-        names = cells.sweep_axes(dataset)
-        if len(names) != 1 or names == ["point"]:
-            raise InputError(
-                f"axes = {cells.described_axes(dataset)}: allowed is one axis of several values for a figure of basins"
-            )
-        cells.require(dataset, *_NEEDED)
-        return _curves(dataset, names[0])
+    names = charts.sweep_axes(dataset)
+    if len(names) != 1 or names == ["point"]:
+        raise charts.wrong_axes(dataset, "one axis of several values for a figure of basins")
+    charts.require(dataset, *_NEEDED)
+    (name,) = names
+    size, share = (dataset[key].transpose(name, "attractor").values for key in _NEEDED)
+    error = dataset["basin_error"].transpose(name, "attractor").values if "basin_error" in dataset else 0 * share
+    # Without a stored period multiple, attractors with a size are periodic.
+    multiple = np.isfinite(size)
+    if "attractor_multiple" in dataset:
+        multiple = dataset["attractor_multiple"].transpose(name, "attractor").values
+    branch = _followed(dataset[name].values, size, np.isfinite(share), multiple)
+    sheet = Sheet(2, height=2.2, sharey=False)
+    upper, lower = sheet.axes[:, 0]
+    for number in range(branch.max(initial=-1) + 1):
+        i, k = np.nonzero(branch == number)
+        x, turn = dataset[name].values[i], number // len(ATTRACTOR_COLOURS)
+        style = {"linestyle": "", "marker": _MARKERS[turn % len(_MARKERS)], "markersize": 2.5}
+        style["color"] = ATTRACTOR_COLOURS[number % len(ATTRACTOR_COLOURS)]
+        label = f"motion {ascii_uppercase[number % 26]}{number // 26 or ''}"
+        sheet.add(*upper.plot(x, size[i, k], **style, label=label))
+        lower.errorbar(x, share[i, k], error[i, k], **style, elinewidth=0.8)
+    fit_axis(upper, "x", dataset[name].values)
+    upper.set_ylim(bottom=min(0.0, float(dataset["attractor_u_max"].min())))
+    lower.set_ylim(-0.03, 1.03)
+    sheet.label(axis_label(dataset[name]), variable_label(dataset["attractor_u_max"]), "share of the initial states")
+    return sheet.finish(dataset)
 
 
 def _followed(x: np.ndarray, size: np.ndarray, exists: np.ndarray, multiple: np.ndarray) -> np.ndarray:
@@ -87,43 +100,3 @@ def _gap(size: float, likely: tuple[float, float]) -> float:
     if not np.isfinite(size):
         return 0.0 if size == likely[0] else np.inf
     return float(np.nanmin(np.abs(size - np.array(likely)))) / max(abs(size), _REST)
-
-
-def _letter(number: int) -> str:
-    return f"{ascii_uppercase[number % 26]}{number // 26 or ''}"
-
-
-def _curves(dataset: xr.Dataset, name: str) -> Figure:
-    size, share = (dataset[each].transpose(name, "attractor").values for each in _NEEDED)
-    error = dataset["basin_error"].transpose(name, "attractor").values if "basin_error" in dataset else 0 * share
-    exists = np.isfinite(share)
-    # Without a stored period multiple, attractors with a size are periodic.
-    multiple = np.isfinite(size)
-    if "attractor_multiple" in dataset:
-        multiple = dataset["attractor_multiple"].transpose(name, "attractor").values
-    branch = _followed(dataset[name].values, size, exists, multiple)
-    count = branch.max(initial=-1) + 1
-    further = max(math.ceil(count / _ENTRIES) - 2, 0) * _ENTRY_HEIGHT
-    panels = Panels(2, height=_HEIGHT, margins=Margins(left=1.0, right=0.3, bottom=0.9 + further), share_y=False)
-    (upper,), (lower,) = panels.axes
-    handles = []
-    for number in range(count):
-        i, k = np.nonzero(branch == number)
-        x = dataset[name].values[i]
-        style = {
-            "color": ATTRACTOR_COLOURS[number % len(ATTRACTOR_COLOURS)],
-            "linestyle": "",
-            "marker": _MARKERS[number // len(ATTRACTOR_COLOURS) % len(_MARKERS)],
-            "markersize": 2.5,
-        }
-        handles += upper.plot(x, size[i, k], **style, label=f"motion {_letter(number)}")
-        lower.errorbar(x, share[i, k], error[i, k], **style, elinewidth=0.8)
-    cells.fit_axis(upper, "x", dataset[name].values)
-    upper.set_ylim(bottom=min(0.0, float(dataset["attractor_u_max"].min())))
-    lower.set_ylim(-0.03, 1.03)
-    panels.label_row(upper, variable_label(dataset["attractor_u_max"]))
-    panels.label_row(lower, "share of the initial states")
-    panels.label_axes(axis_label(dataset[name]))
-    panels.titles(dataset)
-    panels.legend(handles)
-    return panels.figure

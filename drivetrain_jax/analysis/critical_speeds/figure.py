@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-import textwrap
 from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
 import xarray as xr
-from matplotlib import ticker
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, Normalize, to_hex
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
@@ -21,13 +19,12 @@ from matplotlib.patheffects import withStroke
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.resonances import stored_orders
-from drivetrain_jax.view import cells, interference
-from drivetrain_jax.view.figure_layout import Margins, Panels
+from drivetrain_jax.view import charts, interference
+from drivetrain_jax.view.sheet import Sheet, is_logarithmic, plain_decades, write_names
 from drivetrain_jax.view.style import (
+    FAILED_COLOUR,
     FRAME_GREY,
     LINE_COLOURS,
-    STATE_COLOURS,
-    STYLE,
     axis_label,
     in_brackets,
     scene_key,
@@ -37,12 +34,7 @@ from drivetrain_jax.view.style import (
 from drivetrain_jax.view.units import suitable, unit_of, value_in
 
 _FREQUENCIES = ("critical_speed", "natural_frequency", "angular_frequency")
-_HEIGHT, _SHAPE_HEIGHT, _MAP_HEIGHT = 3.4, 1.15, 2.3
 _MOST_SHAPES, _MOST_MAPS = 6, 4
-# Largest number of letters of a label along one map.
-_LETTERS = 32
-# Least distance between the names of two curves, in points.
-_LABEL_HEIGHT = 8.0
 # Line styles and colours of the orders, from the first on.
 _DASHES, _ORDER_COLOURS = ("solid", (0, (4, 2))), ("black", LINE_COLOURS[1])
 # Ratio to the other frequencies below which a frequency counts as zero; a logarithmic axis cannot show zero.
@@ -64,26 +56,23 @@ def plot(dataset: xr.Dataset) -> Figure:
     crossed. Raises :class:`InputError` for more than two axes, and if no variable that can be drawn is stored or has a
     value.
     """
-    with matplotlib.rc_context(STYLE):
-        dataset = cells.prepare(dataset)
-        names = cells.sweep_axes(dataset)
-        if not names and "mode_shape" in dataset:
-            return _shapes(dataset)
-        shown = next((name for name in _FREQUENCIES if name in dataset), None)
-        orders = stored_orders(dataset.attrs)
-        if shown and not names and orders:
-            cells.require_values(dataset[shown], positive=True)
-            colours = [to_hex(colour) for colour in _colours(dataset.sizes["mode"])]
-            return interference.draw(dataset, orders, colours, {})
-        if shown is None or not names:
-            stored = ", ".join(str(name) for name in dataset.data_vars)
-            needed = "an axis and one of " + ", ".join(_FREQUENCIES) if names else "mode_shape, or an axis"
-            raise InputError(f"outputs = {stored}: nothing to plot; the figure needs {needed}")
-        if len(names) == 1:
-            return _curves(dataset, names[0], shown)
-        if len(names) == 2:
-            return _maps(dataset, names, shown)
-        raise InputError(f"axes = {', '.join(names)}: allowed are one or two axes for a figure of critical speeds")
+    names = charts.sweep_axes(dataset)
+    if not names and "mode_shape" in dataset:
+        return _shapes(dataset)
+    shown = next((name for name in _FREQUENCIES if name in dataset), None)
+    orders = stored_orders(dataset.attrs)
+    if shown and not names and orders:
+        return interference.draw(dataset, orders, [to_hex(c) for c in _colours(dataset.sizes["mode"])], {})
+    if shown is None or not names:
+        stored = ", ".join(str(name) for name in dataset.data_vars)
+        needed = "an axis and one of " + ", ".join(_FREQUENCIES) if names else "mode_shape, or an axis"
+        raise InputError(f"outputs = {stored}: nothing to plot; the figure needs {needed}")
+    if len(names) == 1:
+        dataset = charts.along_points(dataset) if names == ["point"] else dataset
+        return _curves(dataset, charts.sweep_axes(dataset)[0], shown)
+    if len(names) == 2:
+        return _maps(dataset, names, shown)
+    raise charts.wrong_axes(dataset, "one or two axes for a figure of critical speeds")
 
 
 def _colours(count: int) -> np.ndarray:
@@ -91,57 +80,54 @@ def _colours(count: int) -> np.ndarray:
     return matplotlib.colormaps["viridis"](np.linspace(0.0, 0.75, count))
 
 
-def _abscissa(dataset: xr.Dataset, name: str) -> xr.DataArray:
-    """The coordinate of the horizontal axis: the axis, or the first parameter of a list of points."""
-    if name in dataset.coords and name != "point":
-        return dataset[name]
-    own = [c for c in dataset.coords.values() if c.dims == (name,) and c.name != name]
-    if not own:
-        raise InputError("points: no parameter varies; the figure needs one")
-    return own[0]
-
-
 def _curves(dataset: xr.Dataset, name: str, shown: str) -> Figure:
-    abscissa = _abscissa(dataset, name)
-    order = np.argsort(abscissa.values, kind="stable")
-    x, y = abscissa.values[order], dataset[shown].transpose("mode", name).values[:, order]
-    logarithmic = cells.is_logarithmic(x)
-    cells.require_values(dataset[shown], positive=logarithmic)
-    panels = Panels(height=_HEIGHT, margins=Margins(right=0.75, left=1.0))
-    axes = panels.axes[0][0]
-    drawn = np.where(y > _NEGLIGIBLE * np.nanmax(y), y, np.nan) if logarithmic else y
-    for colour, curve, mode in zip(_colours(len(y)), drawn, dataset["mode"].values, strict=True):
-        axes.plot(x, curve, color=colour, marker="o" if len(x) < 12 else None, markersize=3, label=f"mode {mode}")
-    cells.fit_axis(axes, "x", x)
+    x, y = dataset[name].values, dataset[shown].transpose("mode", name)
+    logarithmic = is_logarithmic(x)
+    charts.require_values(y, positive=logarithmic)
+    speeds = y.where(y > _NEGLIGIBLE * y.max()) if logarithmic else y
+    colours, drawn = _colours(len(y)), speeds.values
+    sheet = charts.stack(dataset.assign({shown: speeds}), name, [[shown]], height=3.4, colours=colours, named=False)
+    axes = sheet.axes[0, 0]
     axes.set_xlim(x[0], x[-1])
+    axes.set(yscale="log") if logarithmic else axes.set_ylim(bottom=0.0)
+    present = [np.flatnonzero(np.isfinite(curve)) for curve in drawn]
+    kept = [k for k, places in enumerate(present) if places.size]
+    ends = np.array([(x[present[k][-1]], drawn[k, present[k][-1]]) for k in kept]).reshape(-1, 2)
+    modes = [f"mode {mode}" for mode in dataset["mode"].values[kept]]
+    sheet.later(lambda: write_names(axes, ends, modes, colours=colours[kept]))
+    if shown == "critical_speed":
+        _draw_orders(sheet, axes, dataset, x, drawn)
+    if operating := _operating(dataset, shown):
+        # A logarithmic axis has no zero.
+        low = operating[0] or min(axes.get_ylim()[0], operating[1] / 10)
+        band = {"color": LINE_COLOURS[1], "alpha": 0.2, "zorder": 0, "label": "operating speeds"}
+        sheet.add(axes.axhspan(low, operating[1], **band))
     if logarithmic:
-        axes.set_yscale("log")
-    else:
-        axes.set_ylim(bottom=0.0)
-    _label_curves(axes)
-    higher = _draw_orders(axes, dataset, x, drawn) if shown == "critical_speed" else []
-    operating = _draw_range(axes, _operating(dataset, shown))
-    if logarithmic:
-        cells.plain_decades(axes, "y")
+        plain_decades(axes, "y")
     axes.grid(color=FRAME_GREY, alpha=0.2, linewidth=0.5)
-    axes.set_ylabel(variable_label(dataset[shown]))
-    panels.label_axes(_every(dataset, abscissa, name))
-    panels.titles(dataset)
-    panels.legend([*higher, *operating, *_doubtful(axes, dataset, name, x, drawn, order)])
-    return panels.figure
+    if "count_certified" in dataset:
+        doubtful = (dataset["count_certified"].transpose("mode", name).values == 0) & np.isfinite(drawn)
+        style: dict[str, Any] = {"linestyle": "none", "marker": "x", "color": FAILED_COLOUR, "markersize": 5}
+        for row, curve in zip(doubtful, drawn, strict=True):
+            sheet.add(
+                *(axes.plot(x[row], curve[row], **style, label="not certified by the count") if row.any() else ())
+            )
+    # Other parameters of a list of points that equal the first.
+    equal = [str(c.name) for c in dataset.coords.values() if c.dims == (name,) and c.name not in (name, "point")]
+    equal = [other for other in equal if np.array_equal(dataset[other].values, x)]
+    sheet.label(" = ".join([axis_label(dataset[name]), *equal]), variable_label(dataset[shown]))
+    return sheet.finish(dataset)
 
 
-def _draw_orders(axes: Axes, dataset: xr.Dataset, x: np.ndarray, speeds: np.ndarray) -> list[Artist]:
-    """Draw the speeds at which higher orders meet the modes of ``speeds`` (modes, points); returns legend entries."""
+def _draw_orders(sheet: Sheet, axes: Axes, dataset: xr.Dataset, x: np.ndarray, speeds: np.ndarray) -> None:
+    """Draw the speeds at which higher orders meet the modes of ``speeds`` (modes, points)."""
     orders = stored_orders(dataset.attrs)
-    handles: list[Artist] = []
     for (label, times), dashes in zip(orders.per_turn.items() if orders else (), _DASHES, strict=False):
         style = {"linestyle": dashes, "linewidth": 1.2 if times == 1 else 0.7}
         if times != 1:
             axes.set_prop_cycle(color=_colours(len(speeds)))
             axes.plot(x, speeds.T / times, **style)
-        handles.append(Line2D([], [], color=FRAME_GREY, label=label, **style))
-    return handles
+        sheet.add(Line2D([], [], color=FRAME_GREY, label=label, **style))
 
 
 def _operating(dataset: xr.Dataset, shown: str) -> tuple[float, float] | None:
@@ -152,117 +138,38 @@ def _operating(dataset: xr.Dataset, shown: str) -> tuple[float, float] | None:
     return (low * rpm, high * rpm) if high > 0 else None
 
 
-def _draw_range(axes: Axes, operating: tuple[float, float] | None) -> list[Artist]:
-    """Draw the operating speeds as a band, down to the lower edge of ``axes`` if they begin at standstill."""
-    if operating is None:
-        return []
-    low, high = operating
-    # A logarithmic axis has no zero.
-    low = low or min(axes.get_ylim()[0], high / 10)
-    return [axes.axhspan(low, high, color=LINE_COLOURS[1], alpha=0.2, zorder=0, label="operating speeds")]
-
-
-def _label_curves(axes: Axes) -> None:
-    """Write the names of the curves at their right ends, without overlaps."""
-    taken = -np.inf
-    for line in axes.get_lines():
-        x, y = map(np.asarray, line.get_data())
-        present = np.flatnonzero(np.isfinite(y))
-        if not present.size:
-            continue
-        end = (x[present[-1]], y[present[-1]])
-        height = axes.transData.transform(end)[1] * 72 / axes.figure.dpi
-        if height > taken + _LABEL_HEIGHT:
-            label, colour = line.get_label(), line.get_color()
-            axes.annotate(label, end, (4, 0), textcoords="offset points", va="center", color=colour)  # pyright: ignore[reportArgumentType]
-            taken = height
-
-
-def _every(dataset: xr.Dataset, abscissa: xr.DataArray, name: str) -> str:
-    """Label of the horizontal axis, including parameters of a list of points that equal it."""
-    equal = [
-        str(c.name)
-        for c in dataset.coords.values()
-        if c.dims == (name,) and c.name not in (abscissa.name, name) and np.array_equal(c.values, abscissa.values)
-    ]
-    return " = ".join([axis_label(abscissa), *equal])
-
-
-def _doubtful(
-    axes: Axes, dataset: xr.Dataset, name: str, x: np.ndarray, y: np.ndarray, order: np.ndarray
-) -> list[Artist]:
-    """Draw crosses over uncertified frequencies."""
-    if "count_certified" not in dataset:
-        return []
-    doubtful = dataset["count_certified"].transpose("mode", name).values[:, order] == 0
-    if not (doubtful & np.isfinite(y)).any():
-        return []
-    style = {"linestyle": "none", "marker": "x", "color": STATE_COLOURS[cells.FAILED], "markersize": 5}
-    for row, curve in zip(doubtful, y, strict=True):
-        axes.plot(x[row], curve[row], **style)
-    return [Line2D([], [], **style, label="not certified by the count")]
-
-
 def _maps(dataset: xr.Dataset, names: list[str], shown: str) -> Figure:
-    cells.require_values(dataset[shown], positive=True)
-    horizontal = cells.horizontal_axis(dataset, names)
-    vertical = next(name for name in names if name != horizontal)
-    modes = [mode for mode in range(dataset.sizes["mode"]) if float(dataset[shown].isel(mode=mode).max()) > 0]
-    modes = modes[:_MOST_MAPS]
-    panels = Panels(len(modes), height=_MAP_HEIGHT, margins=Margins(right=1.25, left=1.0))
-    operating: dict[str, Artist] = {}
-    for (axes,), mode in zip(panels.axes, modes, strict=True):
-        field = dataset[shown].isel(mode=mode)
-        values = field.values[np.isfinite(field.values) & (field.values > 0)]
-        low, high = values.min(), values.max()
-        norm = LogNorm(low, high) if high > 3 * low else Normalize(low, high)
-        cmap = matplotlib.colormaps["viridis"].with_extremes(bad=STATE_COLOURS[cells.FAILED])
-        field = field.where(field.isnull() | (field > low), low)
-        mesh = cells.draw_cells(axes, field, horizontal, vertical, cmap=cmap, norm=norm)
-        operating |= _draw_limits(axes, dataset, shown, mode, (horizontal, vertical))
-        label = f"mode {dataset['mode'].values[mode]}: {variable_label(field)}"
-        bar: dict[str, Any] = {"format": ticker.StrMethodFormatter("{x:g}"), "ticks": _ticks(low, high)}
-        panels.colorbar(axes, mesh, label, **bar)
-        panels.figure.axes[-1].yaxis.set_minor_formatter(ticker.NullFormatter())
-        axes.set_ylabel(textwrap.fill(axis_label(dataset[vertical]), _LETTERS))
-    panels.label_axes(axis_label(dataset[horizontal]))
-    panels.titles(dataset)
-    panels.legend([*operating.values(), *cells.failure_legend(dataset)])
-    return panels.figure
+    charts.require_values(dataset[shown], positive=True)
+    names = charts.horizontal_first(dataset, names)
+    rows = [row for row in charts.split(dataset, shown) if float(row[1][0][shown].max()) > 0][:_MOST_MAPS]
+    sheet = charts.maps(rows, names)
+    for (axes,), (_, (part,)) in zip(sheet.axes, rows, strict=True):
+        _draw_limits(sheet, axes, part, shown, names)
+    return sheet.finish(dataset)
 
 
-def _draw_limits(axes: Axes, dataset: xr.Dataset, shown: str, mode: int, names: tuple[str, str]) -> dict[str, Artist]:
-    """Draw lines where an order meets ``mode`` at the lowest or highest operating speed; returns legend entries."""
-    field, orders = dataset[shown].isel(mode=mode), getattr(stored_orders(dataset.attrs), "per_turn", {"": 1.0})
+def _draw_limits(sheet: Sheet, axes: Axes, part: xr.Dataset, shown: str, names: list[str]) -> None:
+    """Draw lines where an order meets the mode at the lowest or highest operating speed."""
+    field, orders = part[shown], getattr(stored_orders(part.attrs), "per_turn", {"": 1.0})
     x, y, heights = field[names[0]], field[names[1]], field.transpose(*reversed(names))
-    handles: dict[str, Artist] = {}
     # A white outline keeps the lines visible on the dark end of the map.
     style = {"linewidth": 1.0, "path_effects": [withStroke(linewidth=2.4, foreground="white")]}
     for (order, times), colour in zip(orders.items(), _ORDER_COLOURS, strict=False):
-        limits = zip(("lowest", "highest"), _operating(dataset, shown) or (), ("dashed", "solid"), strict=False)
+        limits = zip(("lowest", "highest"), _operating(part, shown) or (), ("dashed", "solid"), strict=False)
         for name, speed, dashes in limits:
             if not float(field.min()) < times * speed < float(field.max()):
                 continue
             axes.contour(x, y, heights, [times * speed], colors=colour, linestyles=dashes).set(**style)
             label = f"{name} operating speed" + ("" if times == 1 else f", {order}")
-            handles[label] = Line2D([], [], color=colour, linestyle=dashes, label=label, **style)
-    return handles
-
-
-def _ticks(low: float, high: float) -> np.ndarray:
-    """Ticks at 1, 2, 5 and their decades, or round numbers if these are too few."""
-    decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
-    marks = np.outer(decades, [1, 2, 5]).ravel()
-    inside = marks[(marks >= low) & (marks <= high)]
-    return inside if len(inside) > 1 else ticker.MaxNLocator(5).tick_values(low, high)  # pyright: ignore[reportReturnType]
+            sheet.add(Line2D([], [], color=colour, linestyle=dashes, label=label, **style))
 
 
 def _shapes(dataset: xr.Dataset) -> Figure:
     count = min(dataset.sizes["mode"], _MOST_SHAPES)
-    panels = Panels(count, height=_SHAPE_HEIGHT, margins=Margins(right=0.3, between_rows=0.3))
+    sheet = Sheet(count, height=1.4)
     shaft = _Shaft.of(dataset)
     x = dataset["x"].values * shaft.total
-    for (axes,), index, colour in zip(panels.axes, range(count), _colours(count), strict=True):
+    for (axes,), index, colour in zip(sheet.axes, range(count), _colours(count), strict=True):
         shape = dataset["mode_shape"].isel(mode=index).values
         shaft.draw(axes)
         axes.axhline(0.0, color=FRAME_GREY, linewidth=0.6)
@@ -271,10 +178,9 @@ def _shapes(dataset: xr.Dataset) -> Figure:
         axes.set(xlim=(-0.02 * shaft.total, 1.02 * shaft.total), ylim=(-1.25, 1.25), yticks=(-1.0, 0.0, 1.0))
         axes.set_title(_name(dataset, index), loc="left", pad=3, color=FRAME_GREY, size=8)
     distance = f"distance from A{in_brackets(unit_of(dataset, 'length', 'm')[1])}"
-    panels.label_axes(distance if shaft.edges else variable_label(dataset["x"]), "deflection, largest 1")
-    panels.titles(dataset)
-    panels.legend(shaft.legend())
-    return panels.figure
+    sheet.label(distance if shaft.edges else variable_label(dataset["x"]), "deflection, largest 1")
+    sheet.add(*shaft.legend())
+    return sheet.finish(dataset)
 
 
 class _Shaft(NamedTuple):
@@ -329,9 +235,10 @@ class _Shaft(NamedTuple):
             axes.add_patch(Rectangle(*box, facecolor=FRAME_GREY, alpha=0.2, edgecolor="none"))
         for name, places in self.points.items():
             level = -0.45 * _THICKNESS - 0.2 if name == "support" else 0.0
-            axes.plot(
-                places, [level] * len(places), clip_on=False, linestyle="none", color=FRAME_GREY, **_SYMBOLS[name]
-            )
+            style: dict[str, Any] = {"clip_on": False, "linestyle": "none", "color": FRAME_GREY} | _SYMBOLS[name]
+            # An empty line that is not clipped would disturb the layout.
+            if places:
+                axes.plot(places, [level] * len(places), **style)
 
     def legend(self) -> list[Artist]:
         """Entries for the symbols that are drawn."""

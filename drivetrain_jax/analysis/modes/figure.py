@@ -16,19 +16,18 @@ from matplotlib.lines import Line2D
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.modes.planetary_gear import BODY_COLOURS, draw_gear
 from drivetrain_jax.resonances import Orders, stored_orders
-from drivetrain_jax.view import cells, interference
-from drivetrain_jax.view.figure_layout import Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, STYLE, axis_label, in_brackets, scene_key, units_of, variable_label
+from drivetrain_jax.view import charts, interference
+from drivetrain_jax.view.sheet import Sheet, fit_axis, plain_decades, write_names
+from drivetrain_jax.view.style import FRAME_GREY, axis_label, in_brackets, scene_key, units_of, variable_label
 from drivetrain_jax.view.units import value_in
 
 # Colours of rigid modes, of the families in their order, and of coupled modes.
 _RIGID, _FAMILIES, _COUPLED = "#9a9a9a", ("#16324f", "#d1771e", "#3f8f5f", "#7a4fa0", "#999933"), "#a0308c"
-_CURVES_HEIGHT, _GEAR_HEIGHT = 4.4, 1.62
 _COLUMNS, _MOST_SHAPES = 4, 16
 # Relative difference below which frequencies are one multiple frequency, with one shape drawn.
 _SAME = 1e-8
-# Relative distances at which neighbours are close, and at which they are two frequencies; least distance of names in points.
-_NEAR, _SPLIT, _LINE = 0.01, 1e-6, 7.5
+# Relative distances at which neighbours are close, and at which they are two frequencies.
+_NEAR, _SPLIT = 0.01, 1e-6
 
 
 def plot(dataset: xr.Dataset) -> Figure:
@@ -36,21 +35,17 @@ def plot(dataset: xr.Dataset) -> Figure:
 
     A single point without shapes is an interference diagram, if the numbers of teeth are known.
     Curves follow the stored ``branch``, so colours do not change where frequencies cross or veer; without it every point is
-    a dot. Zero frequencies are not visible on the logarithmic scale. Axes of one value count as fixed. Raises
-    :class:`InputError` for more than one axis, and if needed variables are not stored or have no value.
+    a dot. Zero frequencies are not visible on the logarithmic scale. Raises :class:`InputError` for more than one axis, and
+    if needed variables are not stored or have no value.
     """
-    with matplotlib.rc_context(STYLE):
-        dataset = cells.prepare(dataset)
-        names = cells.sweep_axes(dataset)
-        if names == [] and "mode_shape" not in dataset and (orders := stored_orders(dataset.attrs)):
-            return _interference(dataset, orders)
-        if names == []:
-            return _shapes(dataset)
-        if len(names) == 1 and names != ["point"]:
-            return _curves(dataset, names[0])
-        raise InputError(
-            f"axes = {', '.join(names)}: allowed is one axis for a figure of frequencies, or none for mode shapes"
-        )
+    names = charts.sweep_axes(dataset)
+    if not names and "mode_shape" not in dataset and (orders := stored_orders(dataset.attrs)):
+        return _interference(dataset, orders)
+    if not names:
+        return _shapes(dataset)
+    if len(names) == 1 and names != ["point"]:
+        return _curves(dataset, names[0])
+    raise charts.wrong_axes(dataset, "one axis for a figure of frequencies, or none for mode shapes")
 
 
 def _meanings(dataset: xr.Dataset) -> list[str]:
@@ -80,15 +75,14 @@ def _types(dataset: xr.Dataset, dominant: bool = False) -> np.ndarray:
 
 
 def _curves(dataset: xr.Dataset, name: str) -> Figure:
-    cells.require(dataset, "natural_frequency")
-    cells.require_values(dataset["natural_frequency"], positive=True)
+    charts.require(dataset, "natural_frequency")
+    charts.require_values(dataset["natural_frequency"], positive=True)
     dataset = dataset.transpose(name, ...)
     x, frequency = dataset[name].values, dataset["natural_frequency"].values
     types, colours = _types(dataset, dominant=True), type_colours(dataset)
     close = _close(frequency)
-    height = _CURVES_HEIGHT / (1 + bool(close))
-    panels = Panels(1 + bool(close), height=height, margins=Margins(right=0.6, left=0.9, top=0.6), share_y=False)
-    axes = panels.axes[0][0]
+    sheet = Sheet(1 + bool(close), height=4.4 / (1 + bool(close)), sharey=False)
+    axes, *lower = sheet.axes[:, 0]
     moving = np.where(frequency > 1e-6 * np.nanmax(frequency), frequency, np.nan)
     if "branch" in dataset:
         order = np.argsort(dataset["branch"].values, axis=1, kind="stable")
@@ -101,25 +95,23 @@ def _curves(dataset: xr.Dataset, name: str) -> Figure:
             rows, modes = np.nonzero(types == kind)
             axes.plot(x[rows], moving[rows, modes], ".", markersize=2.5, color=colour)
     axes.set(yscale="log", ylim=(0.93 * np.nanmin(moving), 1.07 * np.nanmax(moving)))
-    cells.plain_decades(axes, "y")
-    if close:
-        _draw_distances(panels.axes[1][0], x, frequency, close)
+    plain_decades(axes, "y")
+    labels = [variable_label(dataset["natural_frequency"])]
+    for below in lower:
+        _draw_distances(sheet, below, x, frequency, close)
         units = in_brackets(units_of(dataset["natural_frequency"]))
-        panels.label_row(panels.axes[1][0], f"distance of close modes (numbers at the right){units}")
-    cells.fit_axis(axes, "x", x)
-    panels.label_row(axes, variable_label(dataset["natural_frequency"]))
-    panels.label_axes(axis_label(dataset[name]))
-    mixed = "coupled" in _types(dataset) and "coupled" not in types
-    panels.titles(dataset, "coupled modes in the colour of their dominant family" if mixed else "")
+        labels.append(f"distance of close modes (numbers at the right){units}")
+    fit_axis(axes, "x", x)
+    sheet.label(axis_label(dataset[name]), *labels)
     shown = [kind for kind in colours if (types[np.isfinite(moving)] == kind).any()]
     if "mode_type" in dataset:
-        panels.legend([Line2D([], [], color=colours[kind], label=kind) for kind in shown])
-    return panels.figure
+        sheet.add(*(Line2D([], [], color=colours[kind], label=kind) for kind in shown))
+    mixed = "coupled" in _types(dataset) and "coupled" not in types
+    return sheet.finish(dataset, "coupled modes in the colour of their dominant family" if mixed else "")
 
 
 def _interference(dataset: xr.Dataset, orders: Orders) -> Figure:
-    cells.require(dataset, "natural_frequency")
-    cells.require_values(dataset["natural_frequency"], positive=True)
+    charts.require(dataset, "natural_frequency")
     types, colours = _types(dataset, dominant=True).tolist(), type_colours(dataset)
     kinds = {kind: colour for kind, colour in colours.items() if kind in types and kind != "rigid"}
     kinds = kinds if "mode_type" in dataset else {}
@@ -134,22 +126,18 @@ def _close(frequency: np.ndarray) -> list[int]:
     return np.flatnonzero(near & (np.nanmin(frequency, axis=0)[:-1] > 0)).tolist()
 
 
-def _draw_distances(axes: Axes, x: np.ndarray, frequency: np.ndarray, close: list[int]) -> None:
+def _draw_distances(sheet: Sheet, axes: Axes, x: np.ndarray, frequency: np.ndarray, close: list[int]) -> None:
     """Draw the distances of neighbours in Hz: the splits and veerings that the axis of the frequencies cannot show."""
-    ends = []
-    for colour, mode in zip(matplotlib.colormaps["viridis"](np.linspace(0, 0.8, len(close))), close, strict=True):
+    colours, ends = matplotlib.colormaps["viridis"](np.linspace(0, 0.8, len(close))), []
+    for colour, mode in zip(colours, close, strict=True):
         distance = frequency[:, mode + 1] - frequency[:, mode]
         distance = np.where(distance > _SPLIT * frequency[:, mode + 1], distance, np.nan)
         axes.plot(x, distance, color=colour, label=f"modes {mode + 1} and {mode + 2}")
-        ends.append((distance[-1], f"{mode + 1}, {mode + 2}", colour))
+        ends.append((x[-1], distance[-1]))
     axes.set_yscale("log")
-    cells.plain_decades(axes, "y")
-    taken = -np.inf
-    for end, text, colour in sorted(ends, key=lambda e: e[0]):
-        height = axes.transData.transform((x[-1], end))[1] * 72 / axes.figure.dpi if np.isfinite(end) else -np.inf
-        if height > taken + _LINE:
-            axes.annotate(text, (x[-1], end), (3, 0), textcoords="offset points", va="center", size=7, color=colour)
-            taken = height
+    plain_decades(axes, "y")
+    names = [f"{mode + 1}/{mode + 2}" for mode in close]
+    sheet.later(lambda: write_names(axes, np.array(ends), names, colours=colours))
 
 
 def _segments(x: np.ndarray, curve: np.ndarray, colours: list[str]) -> LineCollection:
@@ -167,7 +155,7 @@ def _segments(x: np.ndarray, curve: np.ndarray, colours: list[str]) -> LineColle
 
 def _angles(dataset: xr.Dataset) -> list[float]:
     """Angles of the planets, from the fixed parameters or from scalar coordinates of single entries."""
-    name = cells.role(dataset, "planets")
+    name = charts.role(dataset, "planets")
     fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get(name)
     if fixed is None:
         raise InputError(f"{name or 'planets'}: missing; the figure of mode shapes needs the angles of planets")
@@ -190,31 +178,26 @@ def _dominant(dataset: xr.Dataset, mode: int) -> str:
 
 
 def _shapes(dataset: xr.Dataset) -> Figure:
-    cells.require(dataset, "natural_frequency", "mode_shape")
+    charts.require(dataset, "natural_frequency", "mode_shape")
     angles, types, colours = _angles(dataset), _types(dataset), type_colours(dataset)
     families, frequency = _types(dataset, dominant=True), dataset["natural_frequency"].values
     if not np.isfinite(frequency).all():
         raise InputError("natural_frequency = nan: nothing to plot; the point has no result")
-    drawn = _distinct(frequency)[:_MOST_SHAPES]
+    distinct = _distinct(frequency)
+    drawn, left_out = distinct[:_MOST_SHAPES], max(len(distinct) - _MOST_SHAPES, 0)
     units = units_of(dataset["natural_frequency"])
     digits = 1 if units == "Hz" or frequency.max() > 1e3 else 4
-    rows = -(-len(drawn) // _COLUMNS)
     shares = {"dominant_family", "dominant_share"} <= set(dataset) and bool((types == "coupled").any())
-    between, top = (0.42, 1.0) if shares else (0.28, 0.85)
-    margins = Margins(left=0.15, right=0.15, top=top, between_rows=between, between_columns=0.05, bottom=0.45)
-    panels = Panels(rows, _COLUMNS, height=_GEAR_HEIGHT, margins=margins)
-    flat = [axes for row in panels.axes for axes in row]
-    for axes, (mode, count) in zip(flat, drawn, strict=False):
+    sheet = Sheet(-(-len(drawn) // _COLUMNS), _COLUMNS, height=1.95)
+    for axes in sheet.axes.flat:
+        axes.axis("off")
+    for axes, (mode, count) in zip(sheet.axes.flat, drawn, strict=False):
         shape = dataset["mode_shape"].transpose("mode", "dof").values[mode]
         draw_gear(axes, dict(zip(dataset["dof"].values, shape, strict=True)), angles)
         multiple = f" ×{count}" if count > 1 else ""
         kind, family = str(types[mode]), str(families[mode])
         named = _dominant(dataset, mode) if kind == "coupled" and shares else f", {kind}"
         axes.set_title(f"{frequency[mode]:.{digits}f} {units}{multiple}{named}", size=8, color=colours[family], pad=1.5)
-    for axes in flat[len(drawn) :]:
-        axes.axis("off")
-    left_out = len(_distinct(frequency)) - len(drawn)
-    panels.titles(dataset, f"{left_out} higher frequencies not drawn" if left_out else "")
-    rest = Line2D([], [], color=FRAME_GREY, linewidth=0.6, linestyle=(0, (3, 2)), label="at rest")
-    panels.legend([*(Line2D([], [], color=colour, label=body) for body, colour in BODY_COLOURS.items()), rest])
-    return panels.figure
+    sheet.add(*(Line2D([], [], color=colour, label=body) for body, colour in BODY_COLOURS.items()))
+    sheet.add(Line2D([], [], color=FRAME_GREY, linewidth=0.6, linestyle=(0, (3, 2)), label="at rest"))
+    return sheet.finish(dataset, f"{left_out} higher frequencies not drawn" if left_out else "")

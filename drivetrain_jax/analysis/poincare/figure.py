@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import matplotlib
+import textwrap
+
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from drivetrain_jax._errors import InputError
-from drivetrain_jax.view import cells
-from drivetrain_jax.view.figure_layout import Margins, Panels
-from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, STYLE, coordinate_text, in_brackets, power_of_ten, state
+from drivetrain_jax.view import charts
+from drivetrain_jax.view.sheet import Sheet
+from drivetrain_jax.view.style import LINE_COLOURS, coordinate_text, in_brackets, power_of_ten, state
 
-_FIRST = 1000
-_MOST_ROWS = 6
+_FIRST, _MOST_ROWS = 1000, 6
+# Letters of a line above a row of panels.
+_LETTERS = 110
 # Width below which a section is drawn as a point, and least height of a panel, both relative to the size of a component.
 _NARROW, _LOW = 1e-9, 1e-3
-_HEIGHT = 2.6
 
 
 def plot(dataset: xr.Dataset) -> Figure:
@@ -26,57 +26,42 @@ def plot(dataset: xr.Dataset) -> Figure:
     One axis of up to six values gives one row for each value. Raises :class:`InputError` for more axes or values, and
     unless ``section`` is stored.
     """
-    with matplotlib.rc_context(STYLE):
-        dataset = cells.prepare(dataset)
-        cells.require_any(dataset, "section")
-        names = cells.sweep_axes(dataset)
-        if len(names) > 1 or (names and dataset.sizes[names[0]] > _MOST_ROWS):
-            raise InputError(f"axes = {', '.join(names)}: allowed is one axis of up to {_MOST_ROWS} values")
-        parts = [dataset.isel({names[0]: k}) for k in range(dataset.sizes[names[0]])] if names else [dataset]
-        margins = Margins(left=0.95, right=0.35, between_rows=0.55, between_columns=0.35)
-        columns = 2 if dataset.sizes["strobe"] > _FIRST else 1
-        panels = Panels(len(parts), columns, height=_HEIGHT, margins=margins, share_y=False)
-        for row, part in zip(panels.axes, parts, strict=True):
-            _draw_row(row, part, names[0] if names else None)
-        panels.label_axes(*_labels(dataset))
-        panels.titles(dataset)
-        return panels.figure
-
-
-def _labels(dataset: xr.Dataset) -> list[str]:
-    """Names and units of the two components."""
+    charts.require_any(dataset, "section")
+    names = charts.sweep_axes(dataset)
+    if len(names) > 1 or (names and dataset.sizes[names[0]] > _MOST_ROWS):
+        raise charts.wrong_axes(dataset, f"one axis of up to {_MOST_ROWS} values")
+    parts = [dataset.isel({names[0]: k}) for k in range(dataset.sizes[names[0]])] if names else [dataset]
+    columns = 2 if dataset.sizes["strobe"] > _FIRST else 1
+    sheet = Sheet(len(parts), columns, height=3.2, sharex="row", sharey="row")
+    for row, part in zip(sheet.axes, parts, strict=True):
+        _draw_row(row, part, names[0] if names else None)
     described = state(dataset)[:2] or [{"long_name": f"component {i}", "units": "1"} for i in (1, 2)]
-    return [f"{c['long_name']} at the strobes{in_brackets(c['units'])}" for c in described]
+    sheet.label(*(f"{c['long_name']} at the strobes{in_brackets(c['units'])}" for c in described))
+    return sheet.finish(dataset)
 
 
-def _draw_row(row: list[Axes], part: xr.Dataset, name: str | None) -> None:
-    points, scale = part["section"].values, _scale(part)
-    for axes in row[1:]:
-        axes.sharey(row[0])
-    for axes, shown in zip(row, (points, points[:_FIRST])[: len(row)], strict=True):
+def _draw_row(row: np.ndarray, part: xr.Dataset, name: str | None) -> None:
+    points = part["section"].values
+    scale = state(part)[1].get("scale", 1.0) if len(state(part)) > 1 else 1.0
+    for axes, shown in zip(row, (points, points[:_FIRST]), strict=False):
         size = 14.0 if _is_point(points, scale) else 0.6 if len(shown) > 2 * _FIRST else 1.5
         axes.scatter(shown[:, 0], shown[:, 1], s=size, color=LINE_COLOURS[0], linewidths=0, rasterized=True)
-        axes.text(1.0, 1.02, f"{len(shown)} strobes", transform=axes.transAxes, ha="right", va="bottom", size=7.5)
-        axes.tick_params(labelbottom=True)
+        axes.set_title(f"{len(shown)} strobes", loc="left", size=7.5)
     notes = [coordinate_text(part[name])] if name else []
     if "torus_residual" in part:
         distance = power_of_ten(f"{np.max(part['torus_residual'].values):.1e}")
         notes.append(f"distance from a smooth curve {distance} of the largest value")
     if "distinct_points" in part and part["distinct_points"].item():
         notes.append(f"distinct points: {part['distinct_points'].item()}")
-    row[0].text(0.0, 1.08, "; ".join(notes), transform=row[0].transAxes, color=FRAME_GREY, size=7.5)
+    notes.append(row[0].get_title("left"))
+    row[0].set_title(textwrap.fill("; ".join(notes), _LETTERS // len(row)), loc="left", size=7.5)
     first = np.nanmax(np.abs(points[:, 0]), initial=0.0)
     for which, values, least in zip("xy", points.T, (0.0, _LOW * scale * first), strict=True):
         _widen(row[0], which, values[np.isfinite(values)], least)
 
 
-def _scale(dataset: xr.Dataset) -> float:
-    """Ratio of the usual size of the second component to that of the first."""
-    return state(dataset)[1].get("scale", 1.0) if len(state(dataset)) > 1 else 1.0
-
-
 def _is_point(points: np.ndarray, scale: float) -> bool:
-    """True if all finite points are equal up to rounding."""
+    """True if all finite points are equal up to rounding; ``scale`` is the usual ratio of the components."""
     finite = points[np.isfinite(points).all(axis=1)]
     first, second = np.ptp(finite, axis=0) if len(finite) else (np.inf, np.inf)
     size = _NARROW * np.abs(finite[:, 0]).max(initial=0.0)

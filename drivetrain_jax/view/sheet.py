@@ -1,0 +1,212 @@
+"""A figure of panels with title, caption and one legend, laid out by matplotlib; scales of axes, and names beside curves."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import textwrap
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, NullFormatter
+
+from drivetrain_jax.view.style import FRAME_GREY, caption
+
+WIDTH = 7.0
+_DPI, _NOTEBOOK_DPI = 200, 100
+# Mean width of a letter, and width of the line of a legend entry, in inches.
+_LETTER, _ENTRY = 0.068, 0.45
+# Heights of a line of the title, of the caption and of the legend, and of the horizontal label with its numbers, in inches.
+_TITLE, _CAPTION, _LEGEND, _FOOT = 0.18, 0.14, 0.17, 0.45
+_LEFT, _TITLE_LETTERS, _CAPTION_LETTERS = 0.01, 80, 112
+# The place in a paper at either end of a title: it says nothing to a reader without the paper.
+_PAPER = re.compile(r"[^:]*\b(?:Figs?\.?|Tables?|section) \d[^:]*: |, (?:Figs?\.?|Tables?) \d.*$")
+# Least vertical distance of two names beside curves, in points.
+_LINE = 7.5
+
+
+class NotebookFigure(Figure):
+    """A figure that a notebook shows as the result of a cell, without pyplot."""
+
+    def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
+        image = io.BytesIO()
+        self.savefig(image, format="png")
+        width, height = self.get_size_inches()
+        # As large as a figure of pyplot, with full resolution for dense screens.
+        return image.getvalue(), {"width": round(width * _NOTEBOOK_DPI), "height": round(height * _NOTEBOOK_DPI)}
+
+
+class Sheet:
+    """A figure of ``rows x columns`` panels ``axes[row, column]``, each about ``height`` inches high.
+
+    Panels share the horizontal and the vertical axis unless ``options`` of :meth:`matplotlib.figure.Figure.subplots` say
+    otherwise.
+    """
+
+    def __init__(self, rows: int = 1, columns: int = 1, *, height: float, **options: Any) -> None:
+        self.figure = NotebookFigure(figsize=(WIDTH, rows * height), dpi=_DPI, layout="constrained")
+        shared: dict[str, Any] = {"sharex": True, "sharey": True} | options
+        self.axes = self.figure.subplots(rows, columns, squeeze=False, **shared)
+        self._height = height
+        self._entries: dict[str, Artist] = {}
+        self._late: list[Callable[[], None]] = []
+
+    def add(self, *entries: Artist) -> None:
+        """Add entries to the legend; of entries with the same label the first counts."""
+        for entry in entries:
+            self._entries.setdefault(str(entry.get_label()), entry)
+
+    def later(self, write: Callable[[], None]) -> None:
+        """Call ``write`` when the panels have their size, because texts in points depend on it."""
+        self._late.append(write)
+
+    def label(self, horizontal: str, *vertical: str) -> None:
+        """Label the horizontal axes, and the vertical axes: one label for all rows, or one for each."""
+        rows, columns = self.axes.shape
+        for axes in self.axes[-1]:
+            # Several narrow panels have their power of ten at the right end.
+            axes.set_xlabel(_fill(horizontal, 0.85 * WIDTH / columns), loc="center" if columns == 1 else "left")
+        if rows > len(vertical):
+            self.figure.supylabel(_fill(" ".join(vertical), rows * self._height), size=8.5)
+            return
+        for axes, text in zip(self.axes[:, 0], vertical, strict=True):
+            axes.set_ylabel(_fill(text, self._height))
+
+    def colorbar(self, axes: Sequence[Axes], mapped: ScalarMappable, label: str, **options: Any) -> None:
+        """Add a colour bar to a row of panels."""
+        bar = self.figure.colorbar(mapped, ax=list(axes), aspect=15, pad=0.015, fraction=0.08, **options)
+        bar.set_label(_fill(label, self._height))
+        if isinstance(mapped.norm, LogNorm):
+            plain_decades(bar.ax, "y")
+        bar.ax.tick_params(labelsize=7.5)
+
+    def finish(self, dataset: xr.Dataset, note: str = "") -> Figure:
+        """The figure with the scene's title, the fixed parameters (and ``note``), and the legend."""
+        figure, rows = self.figure, len(self.axes)
+        title = textwrap.wrap(shown_title(dataset), _TITLE_LETTERS, break_on_hyphens=False)
+        head = caption_lines("; ".join(part for part in (caption(dataset), note) if part))
+        entries = list(self._entries.values())
+        length = sum(_ENTRY + _LETTER * len(_plain(label)) for label in self._entries)
+        lines = math.ceil(length / WIDTH)
+        top = _TITLE * len(title) + 0.08
+        height = rows * self._height + top + _CAPTION * len(head) + _FOOT + _LEGEND * lines
+        figure.set_figheight(height)
+        # Blank lines of the title keep the space of the caption.
+        blank = "\n" * (math.ceil(_CAPTION / _TITLE * len(head)) + bool(head))
+        if title or head:
+            text = "\n".join(title) + blank
+            figure.suptitle(text, x=_LEFT, ha="left", size=10.5, weight="bold", parse_math=False)
+        figure.text(_LEFT, 1 - top / height, "\n".join(head), va="top", size=8, color=FRAME_GREY)
+        if entries:
+            columns = math.ceil(len(entries) / lines)
+            figure.legend(handles=entries, loc="outside lower left", ncols=columns, columnspacing=1.4, borderpad=0.0)
+        figure.align_ylabels()
+        if self._late:
+            figure.get_layout_engine().execute(figure)  # pyright: ignore[reportOptionalMemberAccess]
+        for write in self._late:
+            write()
+        return figure
+
+
+def shown_title(dataset: xr.Dataset) -> str:
+    """The scene's title without the number of a figure or table of a paper."""
+    title = _PAPER.sub("", str(dataset.attrs.get("title", "")))
+    return title[:1].upper() + title[1:]
+
+
+def caption_lines(text: str) -> list[str]:
+    """``text`` in lines of the figure's width, broken only between its parts and not within a list."""
+    lines = [""]
+    for part in re.split(r"(?<=[,;]) (?![^\[]*\])", text):
+        longer = f"{lines[-1]} {part}".strip()
+        lines[-1:] = [longer] if len(_plain(longer)) <= _CAPTION_LETTERS or not lines[-1] else [lines[-1], part]
+    return lines if text else []
+
+
+def _fill(text: str, inches: float) -> str:
+    """``text`` in lines of about this length; no line begins or ends with a minus sign."""
+    letters = max(int(inches / _LETTER), 20)
+    text = text.replace(" - ", "\u00a0-\u00a0")
+    return textwrap.fill(text, letters, break_long_words=False, break_on_hyphens=False)
+
+
+def _plain(label: str) -> str:
+    """The letters of a label without formula marks."""
+    return re.sub(r"[$^_{}]|\\(?:mathrm|[a-z]+(?=[a-z]))?", "", label)
+
+
+def is_logarithmic(values: np.ndarray) -> bool:
+    """True if ``values`` are spaced by a constant factor rather than a constant step."""
+    if len(values) < 3 or values[0] <= 0:
+        return False
+    steps, factors = np.diff(values), np.diff(np.log(values))
+    return bool(np.ptp(factors) < 1e-6 * np.abs(factors).max() and np.ptp(steps) > 1e-6 * np.abs(steps).max())
+
+
+def cell_edges(values: np.ndarray) -> np.ndarray:
+    """The ``n + 1`` edges of cells around ``n`` rising values: midpoints of neighbours (of logarithms on a logarithmic
+    axis); outer cells are symmetric about their value."""
+    if is_logarithmic(values):
+        return np.exp(_midway(np.log(values)))
+    return _midway(values)
+
+
+def _midway(values: np.ndarray) -> np.ndarray:
+    if len(values) == 1:
+        half = abs(values[0]) / 2 or 0.5
+        return np.array([values[0] - half, values[0] + half])
+    inner = (values[1:] + values[:-1]) / 2
+    return np.concatenate([[2 * values[0] - inner[0]], inner, [2 * values[-1] - inner[-1]]])
+
+
+def fit_axis(axes: Axes, which: str, values: np.ndarray) -> None:
+    """Set scale and limits of one axis from the cells around ``values``; a logarithmic axis shows plain numbers."""
+    edges = cell_edges(values)
+    logarithmic = is_logarithmic(values)
+    axes.set(**{f"{which}scale": "log" if logarithmic else "linear", f"{which}lim": (edges[0], edges[-1])})
+    if logarithmic:
+        plain_decades(axes, which)
+
+
+def plain_decades(axes: Axes, which: str) -> None:
+    """Set plain numbers at 1, 2, 5 (over many decades only at 1) along a logarithmic axis, or powers of ten if plain numbers
+    are long."""
+    low, high = getattr(axes, f"get_{which}lim")()
+    side = getattr(axes, f"{which}axis")
+    side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    # %g writes a million as 1e+06.
+    side.set_major_formatter(plain if low >= 1e-4 and high < 0.99e6 else LogFormatterMathtext())
+    side.set_minor_formatter(NullFormatter())
+
+
+def write_names(
+    axes: Axes, ends: np.ndarray, names: Sequence[str], offset: tuple[float, float] = (3, 0), colours: Any = FRAME_GREY
+) -> None:
+    """Write ``names`` beside the points ``ends`` (n, 2), ``offset`` points away; of close neighbours the first and the last.
+
+    ``colours`` are one for all or one for each name.
+    """
+    colours = [colours] * len(names) if isinstance(colours, str) else list(colours)
+    heights = axes.transData.transform(ends)[:, 1] * 72 / axes.figure.dpi
+    groups: list[list[int]] = []
+    for k in np.argsort(heights).tolist():
+        if not np.isfinite(heights[k]):
+            continue
+        if groups and heights[k] < heights[groups[-1][0]] + _LINE:
+            groups[-1].append(k)
+        else:
+            groups.append([k])
+    for group in groups:
+        text = "\N{EN DASH}".join(dict.fromkeys((names[group[0]], names[group[-1]])))
+        point = (ends[group[-1], 0], ends[group, 1].mean())
+        style: dict[str, Any] = {"va": "center", "size": 7, "annotation_clip": True}
+        axes.annotate(text, point, offset, textcoords="offset points", color=colours[group[-1]], **style)
