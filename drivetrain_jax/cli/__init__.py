@@ -20,7 +20,6 @@ from drivetrain_jax.cli.replies import (
     drop_output,
     one_line,
 )
-from drivetrain_jax.cli.signals import leave_on_interrupt
 
 __all__ = ["main"]
 
@@ -34,7 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.environ["MPLBACKEND"] = "agg"
         # A warning of a value, without the line of code that found it.
         warnings.formatwarning = lambda message, *_, **__: one_line(f"warning: {message}")
-        leave_on_interrupt(INTERRUPTED)
+        # Ctrl-C ends a command at once, also during a compilation; ``run`` has a handler of its own.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             # The parent process has closed this stream, so no one reads its output.
@@ -61,8 +61,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     finally:
         if arguments is None:
-            # The work is finished: ignore signals, which could only change the exit code.
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, signal.SIG_IGN)
             # Skip Python's garbage collection at exit, which takes a third of a second.
             gc.freeze()

@@ -5,22 +5,52 @@ from __future__ import annotations
 import argparse
 import io
 import os
+import signal
 import sys
-from collections.abc import Callable
-from contextlib import ExitStack, nullcontext
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.cli.replies import INCOMPLETE, INTERRUPTED, OK, one_line, say
-from drivetrain_jax.cli.signals import stop_on_signals
 from drivetrain_jax.cli.values import assignments, ranges
 
 _FIGURES = (".png", ".pdf", ".svg")
 # Tables of constants, and their separators.
 _TABLES = {".txt": "", ".csv": ","}
 _PAGES = (".html", ".htm")
+# Time [s] after a signal during which further signals are ignored.
+_GRACE = 2.0
+
+
+@contextmanager
+def _stop_on_signals() -> Iterator[Callable[[], None]]:
+    """Raise ``KeyboardInterrupt`` on Ctrl-C and SIGTERM inside the context.
+
+    Yields a function that raises it again after a signal, because a destructor or a C callback may swallow the first one.
+    Further signals are ignored for two seconds, so that finished chunks are written.
+    """
+    caught: list[float] = []
+
+    def check() -> None:
+        if caught:
+            raise KeyboardInterrupt
+
+    def stop(*_: object) -> None:
+        caught.append(time.monotonic())
+        if len(caught) == 1 or caught[-1] - caught[0] > _GRACE:
+            raise KeyboardInterrupt
+
+    handlers = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield check
+    finally:
+        for number, handler in handlers.items():
+            # A handler that Python did not set cannot be restored.
+            signal.signal(number, handler or signal.SIG_DFL)
 
 
 def list_systems(options: argparse.Namespace) -> int:
@@ -38,7 +68,7 @@ def _answer(reply: Any, options: argparse.Namespace) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Compute or resume a scene. Ctrl-C and SIGTERM stop it; finished blocks are kept."""
-    with stop_on_signals() as check:
+    with _stop_on_signals() as check:
         try:
             progress, code, reason = _compute(options, check)
         except KeyboardInterrupt as stop:

@@ -8,7 +8,6 @@ from typing import Any
 
 from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._wording import clipped
 
 
 def assignments(texts: Sequence[str], field: str) -> dict[str, Any]:
@@ -20,14 +19,9 @@ def assignments(texts: Sequence[str], field: str) -> dict[str, Any]:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not (name and equals and value):
             raise InputError(f"{field} = {text!r}: allowed is name=value")
-        if any("\ud800" <= letter <= "\udfff" for letter in text):
-            raise InputError(f"{field} = {text!a}: not text in the locale of this shell; allowed is UTF-8")
         if name in pairs:
             raise InputError(f"{field} = {text!r}: {name} is given twice; allowed is once")
-        try:
-            pairs[name] = parse_value(value)
-        except RecursionError:
-            raise InputError(f"{field} = {clipped(text)!r}: nested too deeply; allowed is name=value") from None
+        pairs[name] = parse_value(value)
     for name in pairs:
         if table := next((other for other in pairs if name.startswith(f"{other}.")), None):
             raise InputError(f"{field} = {name!r}: it is part of {table!r}, which is given too; allowed is one of them")
