@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
@@ -48,11 +49,10 @@ def number(text: str) -> float:
 def path(text: str) -> Path:
     """A path of valid length; the command checks if the file exists."""
     try:
-        os.path.lexists(text) or os.stat(text)
-    except FileNotFoundError:
-        pass
+        os.lstat(text)
     except OSError as error:
-        raise argparse.ArgumentTypeError(f"{clipped(text)!r}: {error.strerror}") from None
+        if error.errno == errno.ENAMETOOLONG:
+            raise argparse.ArgumentTypeError(f"{clipped(text)!r}: {error.strerror}") from None
     # The shell leaves the ~ of --out=~/r.nc alone.
     return Path(text).expanduser()
 

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     from drivetrain_jax.explore import Page
     from drivetrain_jax.invariants.verify import Report
-    from drivetrain_jax.runs.atlas_answers import Reply
     from drivetrain_jax.runs.atlas_file import StoredAtlas
+    from drivetrain_jax.runs.reply import Reply
 
 
 class DrivetrainAccessor:

@@ -5,10 +5,9 @@ Every design answer is checked by direct solves. For the input see :mod:`~drivet
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from drivetrain_jax.runs.atlas_file import StoredAtlas
 from drivetrain_jax.runs.atlas_question import AtlasQuery, Range, number, roles_of
 from drivetrain_jax.runs.forced_limit import forced_at, forced_over
 from drivetrain_jax.runs.growth_text import growth_at, growth_lines
+from drivetrain_jax.runs.reply import Reply
 from drivetrain_jax.runs.sensitivities import gradient_lines, limit_line, radius_gradient, radius_sensitivities
 
 # Distance of a spectral radius from 1 below which the distance itself is printed.
@@ -38,22 +38,17 @@ BEYOND = {
 }
 
 
-@dataclass(frozen=True, repr=False)
-class Reply:
-    """An answer as text (``str``) and as plain numbers, words and lists (``data``)."""
+Writer = Callable[[str, float], str]
 
-    text: str
-    data: Mapping[str, Any]
 
-    def __str__(self) -> str:
-        return self.text
+@dataclass(frozen=True)
+class _Question(AtlasQuery):
+    """The given values; answers are written by ``writer``, if there is one, instead of in the units of the input."""
 
-    # A notebook shows what `print` does.
-    __repr__ = __str__
+    writer: Writer | None = None
 
-    def to_json(self) -> str:
-        """``data`` as one JSON object; numbers that are not finite become null."""
-        return json.dumps(_plain(self.data), allow_nan=False)
+    def named(self, name: str, value: float) -> str:
+        return self.writer(name, value) if self.writer else super().named(name, value)
 
 
 def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None) -> Reply:
@@ -98,7 +93,7 @@ def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None)
             for each in nearest
         },
     }
-    return Reply("\n".join(lines), data)
+    return Reply(lines, data)
 
 
 def _result_rows(atlas: StoredAtlas, results: Mapping[str, Any], variables: Mapping[str, Variable]) -> list[str]:
@@ -112,40 +107,56 @@ def _result_rows(atlas: StoredAtlas, results: Mapping[str, Any], variables: Mapp
     return rows
 
 
-def least_damping(atlas: StoredAtlas, given: Mapping[str, float | Range], amplitude: Any = None) -> Reply:
+def least_damping(
+    atlas: StoredAtlas, given: Mapping[str, float | Range], amplitude: Any = None, writer: Writer | None = None
+) -> Reply:
     """The least damping above which a range of speeds is stable.
 
     If the largest damping of the atlas is unstable, the answer lists the stable ranges of damping. For a cardan shaft in
     physical units the answer is ``c1``; of given dampings only the ratio ``c2/c1`` is used. Raises as :func:`query`.
     """
-    speed, damping = roles_of(atlas, "speed", "damping")
-    asked = AtlasQuery.of(atlas, given, ranges=(speed,), free=(damping,))
-    answer = design.least_damping(
-        atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.direct
-    )
+    asked, answer = _limit("damping", design.least_damping, atlas, given, writer)
     return _answered("least damping", "from {} on", "largest", asked, answer, amplitude)
 
 
-def widest_angle(atlas: StoredAtlas, given: Mapping[str, float | Range], amplitude: Any = None) -> Reply:
+def widest_angle(
+    atlas: StoredAtlas, given: Mapping[str, float | Range], amplitude: Any = None, writer: Writer | None = None
+) -> Reply:
     """The widest joint angle below which a range of speeds is stable.
 
     If the smallest angle of the atlas is unstable, the answer lists the stable ranges of angle. Raises as :func:`query`.
     """
-    speed, angle = roles_of(atlas, "speed", "angle")
-    asked = AtlasQuery.of(atlas, given, ranges=(speed,), free=(angle,))
-    answer = design.widest_angle(
-        atlas.stability.atlas, atlas.scene.system, asked.values[speed], asked.numbers(), direct=atlas.direct
-    )
+    asked, answer = _limit("angle", design.widest_angle, atlas, given, writer)
     return _answered("widest angle", "up to {}", "smallest", asked, answer, amplitude)
 
 
-def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float = 0.0, amplitude: Any = None) -> Reply:
+def _limit(
+    role: str,
+    question: Callable[..., design.Answer],
+    atlas: StoredAtlas,
+    given: Mapping[str, float | Range],
+    writer: Writer | None,
+) -> tuple[AtlasQuery, design.Answer]:
+    """The limit of the parameter with this ``role`` within which a range of speeds is stable."""
+    speed, limited = roles_of(atlas, "speed", role)
+    asked = replace(_Question.of(atlas, given, ranges=(speed,), free=(limited,)), writer=writer)
+    panels, system = atlas.stability.atlas, atlas.scene.system
+    return asked, question(panels, system, asked.values[speed], asked.numbers(), direct=atlas.direct)
+
+
+def speed_windows(
+    atlas: StoredAtlas,
+    given: Mapping[str, float],
+    margin: float = 0.0,
+    amplitude: Any = None,
+    writer: Writer | None = None,
+) -> Reply:
     """The stable ranges of speed, shortened by ``margin`` times the speed at either end, within a range of speeds if one is
     given. Raises as :func:`query`."""
     if not 0 <= margin < 1:
         raise InputError(f"margin = {margin!r}: allowed is 0 <= margin < 1")
     (speed,) = roles_of(atlas, "speed")
-    asked = AtlasQuery.of(atlas, given, ranges=(), free=(speed,), within=(speed,))
+    asked = replace(_Question.of(atlas, given, ranges=(), free=(speed,), within=(speed,)), writer=writer)
     panels = atlas.stability.atlas
     part = narrow(panels, {speed: asked.values[speed]}) if speed in asked.values else panels
     found = design.speed_windows(part, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.direct)
@@ -156,9 +167,12 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
             asked.named(speed, value) + BEYOND[_kind(asked, speed, *end)]
             for value, end in zip(w.safe, w.interval.ends, strict=True)
         )
-        lines.append(f"  {ends}; largest spectral radius {_from_one(w.largest)} at {speed} = {number(w.where)}")
-        lines.append(f"    {_checked(w.check)}")  # pyright: ignore[reportArgumentType]
-        effects = [limit_line(asked, speed, limit, f"    at {end}: ") for end, limit in _places(w.interval)]
+        lines.append(
+            f"  stable from {ends}; largest spectral radius {_from_one(w.largest)} at {speed} = {number(w.where)}"
+        )
+        lines += [f"    {_checked(w.check)}"] if w.check else []
+        places = zip(("lower", "upper"), (w.interval.lower_end, w.interval.upper_end), strict=True)
+        effects = [limit_line(asked, speed, limit, f"    at the {end} end: ") for end, limit in places]
         lines += [text for text, _ in effects if text]
         sensitivities.append([effect for _, effect in effects])
         lines += [f"    {text}" for text in compared[k]]
@@ -183,7 +197,7 @@ def speed_windows(atlas: StoredAtlas, given: Mapping[str, float], margin: float 
     }
     lines += [] if found.windows else [f"  none {_OPEN if found.undecided else 'within the atlas'}"]
     lines += _undecided(asked, speed, found.undecided)
-    return Reply("\n".join(lines), data)
+    return Reply(lines, data)
 
 
 def _undecided(asked: AtlasQuery, name: str, ranges: Iterable[Range]) -> list[str]:
@@ -193,11 +207,6 @@ def _undecided(asked: AtlasQuery, name: str, ranges: Iterable[Range]) -> list[st
         "  undecided ranges: `drivetrain point` solves a value there directly; a smaller rtol of the atlas narrows them"
     )
     return [*found, remedy] if found else []
-
-
-def _places(interval: Interval) -> tuple[tuple[str, Crossing | None], ...]:
-    """The crossings at both ends of a stable interval, by name."""
-    return ("the lower end", interval.lower_end), ("the upper end", interval.upper_end)
 
 
 def _kind(asked: AtlasQuery, name: str, end: float, crossing: Crossing | None) -> str:
@@ -273,7 +282,7 @@ def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: des
         "check": _check(answer.check),
         **forced,
     }
-    return Reply("\n".join(lines), data)
+    return Reply(lines, data)
 
 
 def _elsewhere(safe: str, asked: AtlasQuery, answer: design.Answer) -> list[str]:
@@ -319,9 +328,8 @@ def _crossing(asked: AtlasQuery, name: str, crossing: Crossing | None) -> dict[s
 
 
 def _check(check: design.Check | None) -> dict[str, Any] | None:
-    if check is None:
-        return None
-    return {"inside": check.inside, "beyond": check.beyond, "solves": check.solves, "agrees": check.agrees}
+    names = ("inside", "beyond", "solves", "agrees")
+    return {name: getattr(check, name) for name in names} if check else None
 
 
 def _checked(check: design.Check) -> str:
@@ -335,15 +343,3 @@ def _from_one(radius: float) -> str:
     """A spectral radius near 1 as its distance from 1, to keep its digits."""
     apart = radius - 1
     return f"{radius:.6g}" if not 0 < abs(apart) < _CLOSE else f"1 {'+' if apart > 0 else '-'} {abs(apart):.1e}"
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {name: _plain(v) for name, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, complex):
-        return {"real": _plain(value.real), "imag": _plain(value.imag)}
-    return None if isinstance(value, float) and not math.isfinite(value) else value

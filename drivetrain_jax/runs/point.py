@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Iterator, KeysView, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,6 +20,7 @@ from drivetrain_jax.runs.forced_limit import Limit
 from drivetrain_jax.runs.growth_text import growth_lines, growth_of, speed_in_rpm
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.physical import described
+from drivetrain_jax.runs.reply import Reply
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import Scene, load_scene, system_and_analysis
 
@@ -83,30 +83,41 @@ class PointResult:
     def __dir__(self) -> list[str]:
         return sorted({*super().__dir__(), *self.values})
 
-    def to_json(self) -> str:
-        """The answer as one JSON object; numbers that are not finite are null."""
-        values = {n: {"value": _plain(v), "units": self.variables[n].units} for n, v in self.values.items()}
+    @property
+    def _reply(self) -> Reply:
+        """The answer with its data."""
+
+        def described(values: Mapping[str, Any], units: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+            return {name: {"value": value, "units": units[name]} for name, value in values.items()}
+
+        values = described(self.values, self.units)
         for name, value in self.values.items():
             if flags := self.variables[name].flags:
                 values[name]["meaning"] = _meaning(flags, value)
-        parameters = {n: {"value": _plain(v), "units": self.parameter_units[n]} for n, v in self.parameters.items()}
-        head = {"system": self.system, "analysis": self.analysis, "method": self.method}
-        if self.physical:
-            parameters_given = {n: {"value": _plain(v), "units": units} for n, (v, units) in self.physical.items()}
-            head |= {"physical": parameters_given}
-        answer = {**head, "parameters": parameters, "outcome": self.outcome.name.lower(), "values": values}
-        if self.growth:
-            answer |= {"growth": dict(self.growth)}
-        if self.forced:
-            answer |= {"forced": self.forced[1]}
-        if self.sensitivities is not None:
-            answer |= {"sensitivities": [each._asdict() for each in self.sensitivities]}
-        if self.orders:
-            speeds = {name: _plain(speed) for name, speed in self.crossings.items()}
-            answer |= {"crossings": {"shaft": self.orders.orders.shaft, "units": "rpm", "values": speeds}}
-        return json.dumps(answer, allow_nan=False)
+        physical = {name: {"value": value, "units": units} for name, (value, units) in self.physical.items()}
+        crossings = {"shaft": self.orders.orders.shaft, "units": "rpm", "values": self.crossings} if self.orders else {}
+        effects = None if self.sensitivities is None else [effect._asdict() for effect in self.sensitivities]
+        answer = {
+            **{"system": self.system, "analysis": self.analysis, "method": self.method},
+            **({"physical": physical} if physical else {}),
+            "parameters": described(self.parameters, self.parameter_units),
+            "outcome": self.outcome.name.lower(),
+            "values": values,
+            **({"growth": self.growth} if self.growth else {}),
+            **({"forced": self.forced[1]} if self.forced else {}),
+            **({} if effects is None else {"sensitivities": effects}),
+            **({"crossings": crossings} if crossings else {}),
+        }
+        return Reply(self._lines(), answer)
+
+    def to_json(self) -> str:
+        """The answer as one JSON object; numbers that are not finite are null."""
+        return self._reply.to_json()
 
     def __repr__(self) -> str:
+        return "\n".join(self._lines())
+
+    def _lines(self) -> list[str]:
         # An empty list is the default "none".
         given = ", ".join(
             _with_units(f"{n} = {written(v)}", self.parameter_units[n]) for n, v in self.parameters.items() if v != ()
@@ -133,8 +144,7 @@ class PointResult:
             lines += self._matrix(name)
         lines += self.orders.lines() if self.orders else []
         lines += [f"  forced amplitude: {self.forced[0]}"] if self.forced else []
-        lines += [f"  {line}" for line in self._effects]
-        return "\n".join(lines)
+        return lines + [f"  {line}" for line in self._effects]
 
     def _matrix(self, name: str) -> list[str]:
         """A result with two dimensions as text, the longer one downwards."""
@@ -155,17 +165,6 @@ class PointResult:
             head = name if variable.units == "1" else f"{name} [{variable.units}]"
             columns.append([head, *(_text(variable, value) for value in self.values[name])])
         return aligned(list(zip(*columns, strict=True)))
-
-
-def _plain(value: Any) -> Any:
-    """Words, numbers and lists as JSON types."""
-    if isinstance(value, str):
-        return value
-    if np.iscomplexobj(value):
-        return {"real": _plain(np.real(value)), "imag": _plain(np.imag(value))}
-    if np.ndim(value):
-        return [_plain(entry) for entry in value]
-    return np.asarray(value).item() if np.isfinite(value) else None
 
 
 def _meaning(flags: Sequence[str], value: Any) -> Any:
