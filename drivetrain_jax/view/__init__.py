@@ -7,6 +7,7 @@ a function from a Dataset to a Figure.
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drivetrain_jax._errors import InputError
@@ -17,20 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Analyses with a figure, analysis/NAME/figure.py.
-_DRAWN = (
-    "floquet",
-    "forced",
-    "history",
-    "lyapunov",
-    "poincare",
-    "parameters",
-    "modes",
-    "harmonic_response",
-    "frequency_response",
-    "steady_state",
-    "basins",
-    "critical_speeds",
-)
+_DRAWN = tuple(sorted(path.parent.name for path in Path(__file__).parents[1].glob("analysis/*/figure.py")))
 # Analyses whose results may share a figure.
 _OVERLAYS = ("frequency_response",)
 

@@ -20,7 +20,7 @@ from matplotlib.ticker import MaxNLocator
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
-from drivetrain_jax.view import boundary_curves, resonance_lines
+from drivetrain_jax.view import overlays
 from drivetrain_jax.view.sheet import Sheet, cell_edges, fit_axis, is_logarithmic, plain_decades
 from drivetrain_jax.view.style import (
     FAILED_COLOUR,
@@ -330,12 +330,12 @@ def maps(
             sheet.add(*(() if _flags(field) else failure_entries(part)))
             _draw_limits(sheet, axes, part, name, names, tips=single and k == 0)
             # Not over other variables, so that narrow tongues stay visible there.
-            lines = resonance_lines.predictions(part, names[0], names[1], forced) if name == rows[0][0] else []
-            sheet.add(*resonance_lines.draw(axes, lines, below=bool(_flags(field))))
+            lines = overlays.predictions(part, names[0], names[1], forced) if name == rows[0][0] else []
+            sheet.add(*overlays.draw_predictions(axes, lines, below=bool(_flags(field))))
             if k == 0:
                 labelled = lines if single else [line for line in lines if line.order == 1]
                 if labelled:
-                    sheet.later(partial(resonance_lines.label, axes, labelled))
+                    sheet.later(partial(overlays.label_predictions, axes, labelled))
             if titles and titles[k][j]:
                 axes.set_title(titles[k][j], pad=24 if k == 0 and lines else 4)
             sheet.add(*_draw_threshold(axes, part, *names))
@@ -377,13 +377,13 @@ def _draw_limits(sheet: Sheet, axes: Axes, part: xr.Dataset, name: str, names: S
     """Draw the traced boundaries, else the limit of stability along the edges of the cells; ``tips`` with their names."""
     if name != "verdict" and not _is_radius(name):
         return
-    sheet.add(*boundary_curves.draw_curves(axes, part, *names))
+    sheet.add(*overlays.draw_boundaries(axes, part, *names))
     if tips:
-        sheet.add(*boundary_curves.draw_tips(axes, part, *names))
+        sheet.add(*overlays.draw_tips(axes, part, *names))
         if "tip_proved" in part.coords:
-            sheet.later(partial(boundary_curves.name_tips, axes, part, *names))
+            sheet.later(partial(overlays.name_tips, axes, part, *names))
     radius = "spectral_radius" if name == "verdict" else name
-    if radius not in part or boundary_curves.traced(part, *names):
+    if radius not in part or overlays.traced(part, *names):
         return
     field = valid(part, radius)
     x, y = (cell_edges(field[axis].values.astype(float)) for axis in names)
@@ -438,11 +438,11 @@ def stack(
     sheet.label(axis_label(dataset[along]), *labels)
     if along in dataset["outcome"].dims:
         sheet.add(*draw_failures(sheet.axes[0, 0], dataset, along))
-    lines = resonance_lines.predictions(dataset, along, forced=forced)
+    lines = overlays.predictions(dataset, along, forced=forced)
     for (axes,) in sheet.axes:
-        sheet.add(*resonance_lines.draw(axes, lines))
+        sheet.add(*overlays.draw_predictions(axes, lines))
     if lines:
-        sheet.later(partial(resonance_lines.label, sheet.axes[0, 0], lines))
+        sheet.later(partial(overlays.label_predictions, sheet.axes[0, 0], lines))
     return sheet
 
 
@@ -469,13 +469,10 @@ def draw_lines(
         style = {"marker": "o", "markersize": 3} | style
     label = ""
     for number, key in enumerate(keys):
-        values, label = _scaled(
-            dataset, valid(dataset, key) if key in dataset and "outcome" in dataset else dataset[key]
-        )
+        values, label, error = _scaled(dataset, valid(dataset, key))
         if _is_radius(key):
             scale_around_limit(axes, values)
         own = next((str(dim) for dim in values.dims if dim != along), None)
-        error, factor = _band_of(dataset, key)
         for k in range(values.sizes[own] if own else 1):
             line = values.isel({own: k}) if own else values
             names = [entry_name(own, line[own].item() if own in line.coords else k)] if own else []
@@ -485,7 +482,7 @@ def draw_lines(
             drawn = axes.plot(x, line, **look)
             sheet.add(*(drawn if names and named else ()))
             if error is not None:
-                half = factor * (error.isel({own: k}) if own else error)
+                half = error.isel({own: k}) if own else error
                 axes.fill_between(x, line - half, line + half, color=look["color"], alpha=0.25, linewidth=0)
         if _is_radius(key) or key == "lyapunov_exponent":
             sheet.add(axes.axhline(0, label="limit of stability", **LIMIT))
@@ -511,28 +508,19 @@ def _without(name: str, words: list[str]) -> str:
     return " ".join(word for word in name.replace(",", "").split() if word not in words)
 
 
-def _scaled(dataset: xr.Dataset, values: xr.DataArray) -> tuple[xr.DataArray, str]:
-    """The values that a panel shows, with their label: the growth of a spectral radius per second, or its excess over 1."""
-    if not _is_radius(values.name):
-        return values, variable_label(values)
-    growth = growth_of(dataset)
-    return (
-        (growth.of(values), growth.label) if _per_second(growth) else (values - 1, f"{variable_label(values)} minus 1")
-    )
+def _scaled(dataset: xr.Dataset, values: xr.DataArray) -> tuple[xr.DataArray, str, xr.DataArray | None]:
+    """The values that a panel shows, their label, and half the width of their band of error, if stored.
 
-
-def _per_second(growth: Growth) -> bool:
-    return growth.label.endswith("[1/s]")
-
-
-def _band_of(dataset: xr.Dataset, key: str) -> tuple[xr.DataArray | None, Any]:
-    """The stored error of a variable and the factor of its band; None without one."""
-    name, factor = _BANDS.get(key, (f"{key}_error", 1.0))
-    if name not in dataset:
-        return None, 1.0
-    growth = growth_of(dataset)
-    # The derivative of the logarithm is 1 near the limit of stability.
-    return dataset[name], growth.factor if _is_radius(key) and _per_second(growth) else factor
+    A spectral radius is shown as growth per second, or as its excess over 1.
+    """
+    name, factor = _BANDS.get(str(values.name), (f"{values.name}_error", 1.0))
+    label, growth = variable_label(values), growth_of(dataset)
+    if _is_radius(values.name) and growth.label.endswith("[1/s]"):
+        # The derivative of the logarithm is 1 near the limit of stability.
+        values, label, factor = growth.of(values), growth.label, growth.factor
+    elif _is_radius(values.name):
+        values, label = values - 1, f"{label} minus 1"
+    return values, label, dataset[name] * factor if name in dataset else None
 
 
 def scale_around_limit(axes: Axes, excess: xr.DataArray) -> None:

@@ -189,35 +189,17 @@ def _given(dataset: xr.Dataset) -> dict[str, set[str]]:
     return {table: set(scene.get(table, ())) for table in ("fixed", "axes", "points")}
 
 
-def _unless_swept(dataset: xr.Dataset, name: str, entry: object) -> object:
-    """A fixed list in which swept entries, such as ``planet_angle[1]``, are marked as varying."""
-    value = entry.get("value") if isinstance(entry, dict) else entry
+def _fixed_text(dataset: xr.Dataset, name: str, entry: Any) -> str:
+    """A fixed value in the unit asked for or given; swept entries of a list, such as ``planet_angle[1]``, vary."""
+    entry = entry if isinstance(entry, dict) else {"value": entry}
+    value, stored = entry.get("value"), str(entry.get("units", "1"))
+    size, units = unit_of(dataset, name, stored)
     if not isinstance(value, (list, tuple)):
-        return entry
-    units = str(entry.get("units", "1")) if isinstance(entry, dict) else "1"
-    axes = {scene_key(c): "varies" if c.ndim else _scalar(c, units) for c in dataset.coords.values()}
+        return value_text(name, value * size if isinstance(value, (int, float)) else value, units)
+    entries = [c for c in dataset.coords.values() if scene_key(c).startswith(f"{name}[")]
+    axes = {scene_key(c): "varies" if c.ndim else float(value_in(c, stored)) for c in entries}
     shown = [axes.get(f"{name}[{i}]", number) for i, number in enumerate(value)]
-    return {**entry, "value": shown} if isinstance(entry, dict) else shown
-
-
-def _scalar(coordinate: xr.DataArray, units: str) -> object:
-    """The value of a scalar coordinate in ``units``."""
-    return float(value_in(coordinate, units)) if coordinate.dtype.kind == "f" else coordinate.item()
-
-
-def _fixed_text(dataset: xr.Dataset, name: str, entry: object) -> str:
-    """A fixed value in the unit asked for or given, with an entry that varies marked."""
-    entry = _unless_swept(dataset, name, entry)
-    if not isinstance(entry, dict):
-        return value_text(name, entry)
-    value, (size, units) = entry.get("value"), unit_of(dataset, name, str(entry.get("units", "1")))
-    if size != 1.0:
-        value = [_times(x, size) for x in value] if isinstance(value, list) else _times(value, size)
-    return value_text(name, value, units)
-
-
-def _times(value: object, size: float) -> object:
-    return value * size if isinstance(value, (int, float)) else value
+    return value_text(name, [x * size if isinstance(x, (int, float)) else x for x in shown], units)
 
 
 def _long_name(variable: xr.DataArray) -> str:

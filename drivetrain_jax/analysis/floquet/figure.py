@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from drivetrain_jax.view import boundary_curves, charts
+from drivetrain_jax.view import charts, overlays
 from drivetrain_jax.view.sheet import Sheet
 from drivetrain_jax.view.style import FRAME_GREY, LINE_COLOURS, axis_label, coordinate_text
 
@@ -65,7 +65,7 @@ def _small_multiples(dataset: xr.Dataset, names: list[str]) -> Figure:
     count = math.prod(dataset.sizes[name] for name in sliced)
     dataset = dataset.isel({name: dataset.sizes[name] // 2 for name in sliced[2:]})
     # If all is stable there is no boundary to draw: show the spectral radius instead, on a scale of its own.
-    plain = _is_stable(dataset) and not boundary_curves.traced(dataset, horizontal, vertical)
+    plain = _is_stable(dataset) and not overlays.traced(dataset, horizontal, vertical)
     dataset = dataset.assign(radius=dataset["spectral_radius"]) if plain else dataset
     rows = [dataset.isel({sliced[1]: k}) for k in _spread(dataset, sliced[1])] if len(sliced) > 1 else [dataset]
     parts = [[row.isel({sliced[0]: k}) for k in _spread(dataset, sliced[0])] for row in rows]

@@ -13,10 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.view import charts
-from drivetrain_jax.view.resonance_lines import draw as draw_resonances
-from drivetrain_jax.view.resonance_lines import label as label_resonances
-from drivetrain_jax.view.resonance_lines import predictions
+from drivetrain_jax.view import charts, overlays
 from drivetrain_jax.view.sheet import Sheet, fit_axis
 from drivetrain_jax.view.style import (
     FAILED_COLOUR,
@@ -36,6 +33,7 @@ _STABLE, _UNSTABLE = range(2)
 _JUMP, _STEEPER = 0.04, 6.0
 # Margin above and below the angles of the phase; rounding tolerance of an angle.
 _ANGLE_MARGIN, _ROUNDING = 0.1, 1e-6
+_QUARTERS = ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"]
 # Relative distance below which motions next to a fold belong together.
 _NEAR = 0.15
 _SPECIAL = {"fold_frequency": ("fold", (0, (1, 2))), "doubling_frequency": ("period doubling", (0, (4, 2)))}
@@ -156,10 +154,14 @@ def _lines(results: list[xr.Dataset]) -> Figure:
         _draw_sweeps(upper, result, amplitude, jumps)
         for axes in lower:
             _draw_sweeps(axes, result, _lag(result), jumps)
-        sheet.add(*_entries(result))
+        line: dict[str, Any] = {"color": _look(result).colour, "linewidth": _look(result).width}
+        if _method(result) != "exact":
+            sheet.add(Line2D([], [], **line, label=_label(result)))
+        for direction, mark in _DIRECTIONS.items() if _method(result) == "exact" else ():
+            sheet.add(Line2D([], [], **line, **_MARK_STYLE, marker=mark, label=f"exact, {direction}"))
     # The margin of matplotlib is a share of the range, which is small for a flat curve.
     upper.set_ylim(0, 1.03 * upper.get_ylim()[1])
-    sheet.add(*_draw_missing(upper, results), *_draw_backbones(upper, results), *_draw_wandering(upper, results))
+    _draw_special(sheet, upper, results)
     best = results[-1]
     if "regime" in best:
         regime = charts.valid(best, "regime")
@@ -178,11 +180,39 @@ def _lines(results: list[xr.Dataset]) -> Figure:
     fit_axis(upper, "x", np.unique(np.concatenate([_along(result).values for result in results])))
     labels = [f"half the peak-to-peak displacement{in_brackets(units_of(results[0]['u_max']))}"]
     for axes in lower:
+        # In rad with numbers in the unit of the figure: half a turn, or a full turn for the lags of a negative drive.
         angle = units_of(results[0]["phase"])
-        _angle_axis(axes, angle, any(bool((_lag(result) > np.pi + _ANGLE_MARGIN).any()) for result in results))
+        longer = any(bool((_lag(result) > np.pi + _ANGLE_MARGIN).any()) for result in results)
+        ticks = np.arange(5 if longer else 3) * np.pi / 2
+        numbers = [f"{tick * suitable('rad', [angle])[0]:g}" for tick in ticks]
+        axes.set_ylim(-_ANGLE_MARGIN, ticks[-1] + _ANGLE_MARGIN)
+        axes.set_yticks(ticks, _QUARTERS[: len(ticks)] if angle == "rad" else numbers)
         labels.append(f"lag of the fundamental{in_brackets(angle)}")
     sheet.label(axis_label(_along(results[0])), *labels)
     return sheet.finish(results[0])
+
+
+def _draw_special(sheet: Sheet, axes: Axes, results: list[xr.Dataset]) -> None:
+    """Draw what is not a periodic motion of a sweep: crosses for none, backbones of free motions, dots for other motions."""
+    dots: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 2.0, "color": FLAG_COLOURS["non_periodic"]}
+    backbone: dict[str, Any] = {"linewidth": 0.7, "linestyle": (0, (6, 2, 1, 2))}
+    omega = [_along(r).values[r["u_max"].isnull().any("sweep_direction").values] for r in results]
+    if count := sum(map(len, omega)):
+        cross: dict[str, Any] = {"linestyle": "", "marker": "x", "markersize": 3.5, "clip_on": False, "zorder": 5}
+        x = np.unique(np.concatenate(omega))
+        label = f"no motion found ({count})"
+        sheet.add(*axes.plot(x, np.zeros(len(x)), color=FAILED_COLOUR, **cross, label=label))
+    height = axes.get_ylim()[1]
+    for result in results:
+        if "backbone_amplitude" in result:
+            free = result["backbone_amplitude"].values
+            # Break the line at steps larger than the height of the axes.
+            line = _broken(_along(result).values, free, np.abs(np.diff(free)) > height)
+            axes.plot(*line, **backbone, color=_look(result).colour, scaley=False)
+            sheet.add(Line2D([], [], **backbone, color=FRAME_GREY, label="backbone"))
+        wandering = _amplitude(result).where(_wandering(result)).transpose(_path(result), ...)
+        if bool(wandering.notnull().any()):
+            sheet.add(*axes.plot(_along(result), wandering, **dots, label="not periodic")[:1])
 
 
 def _draw_sweeps(axes: Axes, result: xr.Dataset, values: xr.DataArray, jumps: dict[str, np.ndarray]) -> None:
@@ -263,19 +293,6 @@ def _joined(x: np.ndarray, y: np.ndarray, stable: np.ndarray) -> tuple[np.ndarra
     return np.array(xs), np.array(ys)
 
 
-def _draw_backbones(axes: Axes, results: list[xr.Dataset]) -> list[Line2D]:
-    """Draw amplitudes of free motions over their frequency in the colours of the methods, within the limits of the axes."""
-    style = {"linewidth": 0.7, "linestyle": (0, (6, 2, 1, 2))}
-    with_backbone = [result for result in results if "backbone_amplitude" in result]
-    height = axes.get_ylim()[1]
-    for result in with_backbone:
-        amplitude = result["backbone_amplitude"].values
-        # Break the line at steps larger than the height of the axes.
-        line = _broken(_along(result).values, amplitude, np.abs(np.diff(amplitude)) > height)
-        axes.plot(*line, **style, color=_look(result).colour, scaley=False)
-    return [Line2D([], [], **style, color=FRAME_GREY, label="backbone")] if with_backbone else []
-
-
 def _wandering(result: xr.Dataset) -> xr.DataArray:
     """True where a sweep met a motion that is not periodic."""
     if "regime" not in result:
@@ -283,54 +300,10 @@ def _wandering(result: xr.Dataset) -> xr.DataArray:
     return result["regime"] == result["regime"].attrs["flag_meanings"].split().index("non_periodic")
 
 
-def _draw_wandering(axes: Axes, results: list[xr.Dataset]) -> list[Line2D]:
-    """Draw dots for motions that are not periodic; returns their legend entry."""
-    style: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 2.0, "color": FLAG_COLOURS["non_periodic"]}
-    entries: list[Line2D] = []
-    for result in results:
-        amplitude = _amplitude(result).where(_wandering(result))
-        for direction in _DIRECTIONS if bool(amplitude.notnull().any()) else ():
-            values = amplitude.sel(sweep_direction=direction)
-            entries = axes.plot(_along(result), values, **style, label="not periodic")
-    return entries
-
-
-def _draw_missing(axes: Axes, results: list[xr.Dataset]) -> list[Line2D]:
-    """Draw crosses on the axis at frequencies where a sweep found no motion."""
-    omega = [_along(r).values[r["u_max"].isnull().any("sweep_direction").values] for r in results]
-    count = sum(map(len, omega))
-    if not count:
-        return []
-    style: dict[str, Any] = {"linestyle": "", "marker": "x", "markersize": 3.5, "clip_on": False, "zorder": 5}
-    x = np.unique(np.concatenate(omega))
-    return axes.plot(x, np.zeros(len(x)), color=FAILED_COLOUR, **style, label=f"no motion found ({count})")
-
-
-def _entries(result: xr.Dataset) -> list[Line2D]:
-    """Legend entries of one result; an exact result has one entry for each sweep."""
-    look = _look(result)
-    style: dict[str, Any] = {"color": look.colour, "linewidth": look.width}
-    if _method(result) != "exact":
-        return [Line2D([], [], **style, label=_label(result))]
-    marks = _DIRECTIONS.items()
-    return [Line2D([], [], **style, **_MARK_STYLE, marker=m, label=f"{look.label}, {d}") for d, m in marks]
-
-
 def _lag(result: xr.Dataset) -> xr.DataArray:
     """The phase [rad] modulo a turn, in [0, 1) turns; small negative values from rounding stay."""
     phase = result["phase"].copy(data=value_in(result["phase"], "rad"))
     return (phase + _ROUNDING) % (2 * np.pi) - _ROUNDING
-
-
-def _angle_axis(axes: Axes, units: str, longer: bool) -> None:
-    """Set an axis of angles in rad, numbered in ``units``: half a turn, or a full turn for larger lags, such as with a drive
-    of negative amplitude."""
-    quarters = 5 if longer else 3
-    axes.set_ylim(-_ANGLE_MARGIN, (quarters - 1) * np.pi / 2 + _ANGLE_MARGIN)
-    labels = ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"]
-    if units != "rad":
-        labels = [f"{k * np.pi / 2 * suitable('rad', [units])[0]:g}" for k in range(5)]
-    axes.set_yticks(np.arange(quarters) * np.pi / 2, labels[:quarters])
 
 
 def _orbits(dataset: xr.Dataset, speed: str) -> Figure:
@@ -344,7 +317,7 @@ def _orbits(dataset: xr.Dataset, speed: str) -> Figure:
     amplitude, x = dataset["branch_amplitude"], dataset[speed].values
     (own,) = (str(dim) for dim in amplitude.dims if dim not in (speed, "branch"))
     sheet = Sheet(amplitude.sizes[own], height=2.6, sharey=False)
-    lines = predictions(dataset, speed, forced=True)
+    lines = overlays.predictions(dataset, speed, forced=True)
     stability = dataset["branch_stability"].transpose(speed, "branch").values
     for (axes,), name, colour in zip(sheet.axes, amplitude[own].values.tolist(), LINE_COLOURS, strict=False):
         values = amplitude.sel({own: name}).transpose(speed, "branch").values
@@ -359,9 +332,9 @@ def _orbits(dataset: xr.Dataset, speed: str) -> Figure:
             marks: list[Artist] = [axes.axvline(value, **style) for value in special[np.isfinite(special)]]
             sheet.add(*marks)
         axes.set_ylim(bottom=0.0)
-        sheet.add(*draw_resonances(axes, lines))
+        sheet.add(*overlays.draw_predictions(axes, lines))
     fit_axis(sheet.axes[0, 0], "x", x)
     sheet.add(*charts.draw_failures(sheet.axes[0, 0], dataset, speed))
     sheet.label(axis_label(dataset[speed]), variable_label(amplitude))
-    sheet.later(lambda: label_resonances(sheet.axes[0, 0], lines))
+    sheet.later(lambda: overlays.label_predictions(sheet.axes[0, 0], lines))
     return sheet.finish(dataset)
