@@ -65,7 +65,10 @@ class Sheet:
             self._entries.setdefault(str(entry.get_label()), entry)
 
     def later(self, write: Callable[[], None]) -> None:
-        """Call ``write`` when the panels have their size, because texts in points depend on it."""
+        """Call ``write`` when the figure has its height, because texts in points depend on it.
+
+        Panels then have matplotlib's usual positions, a few percent from those of the layout, which takes longer.
+        """
         self._late.append(write)
 
     def label(self, horizontal: str, *vertical: str) -> None:
@@ -109,8 +112,6 @@ class Sheet:
             columns = math.ceil(len(entries) / lines)
             figure.legend(handles=entries, loc="outside lower left", ncols=columns, columnspacing=1.4, borderpad=0.0)
         figure.align_ylabels()
-        if self._late:
-            figure.get_layout_engine().execute(figure)  # pyright: ignore[reportOptionalMemberAccess]
         for write in self._late:
             write()
         return figure
