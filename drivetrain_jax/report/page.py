@@ -103,7 +103,7 @@ def _section(path: Path, number: int, asked: list[str], amplitude: Any) -> Secti
     answers, compared, convert = [], False, partial(_in_units, asked)
     if analysis == "atlas":
         # Local import: it loads jax, which other results do not need.
-        from drivetrain_jax.report.atlas_section import atlas_answers
+        from drivetrain_jax.report.computed import atlas_answers
 
         answers, chart, compared = atlas_answers(path, (_LINE_CELLS, _CELLS), convert, amplitude)
     else:
@@ -111,7 +111,7 @@ def _section(path: Path, number: int, asked: list[str], amplitude: Any) -> Secti
     limit = moved = None
     if amplitude is not None and (analysis == "floquet" or amplitudes(chart)):
         # Local import: it loads jax.
-        from drivetrain_jax.report.forced_section import forced_motion, limit_of
+        from drivetrain_jax.report.computed import forced_motion, limit_of
 
         limit = limit_of(chart, amplitude)
         moved = forced_motion(chart) if limit and analysis == "floquet" else None

@@ -9,7 +9,7 @@ import json
 import math
 import re
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -20,28 +20,13 @@ from drivetrain_jax.view.charts import role
 from drivetrain_jax.view.style import scene_key, units_of
 from drivetrain_jax.view.units import ASKED, size, suitable, value_in
 
+if TYPE_CHECKING:
+    from drivetrain_jax.runs.forced_limit import Limit
+
 # Largest number of intervals and of labels that a statement lists.
 _MOST = 8
 # Results that judge the numerics or number something, so that their extremes say nothing.
 _PLAIN = ("_error", "_residual", "_number", "_certified")
-
-
-class Limit(Protocol):
-    """A largest allowed amplitude."""
-
-    @property
-    def value(self) -> float:
-        """The amplitude in the unit ``own``."""
-        ...
-
-    @property
-    def own(self) -> str:
-        """The unit of displacements."""
-        ...
-
-    def written(self, amplitude: float) -> str:
-        """An amplitude as text."""
-        ...
 
 
 def statements(

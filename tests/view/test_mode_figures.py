@@ -11,7 +11,7 @@ from matplotlib.colors import to_hex
 
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis.modes.figure import displacements, type_colours
-from drivetrain_jax.systems._planetary_springs import coordinate_names
+from drivetrain_jax.systems.planetary import coordinate_names
 from drivetrain_jax.view import plot
 from tests.view.results import texts
 

@@ -1,7 +1,8 @@
-"""Answers and chart of an atlas for a report."""
+"""What a report computes: answers and chart of an atlas, and the forced motion at the points of a stability result."""
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -12,7 +13,10 @@ import xarray as xr
 from drivetrain_jax.runs.atlas_answers import least_damping, speed_windows, widest_angle
 from drivetrain_jax.runs.atlas_chart import chart
 from drivetrain_jax.runs.atlas_file import StoredAtlas, open_atlas
+from drivetrain_jax.runs.forced_limit import Limit
 from drivetrain_jax.runs.physical import in_parameters
+from drivetrain_jax.runs.run import run
+from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.view.units import unit_of
 
 
@@ -47,3 +51,21 @@ def _written(atlas: StoredAtlas, shown: xr.Dataset, name: str, value: float) -> 
     name, value, units = quantity or (name, value, atlas.scene.system.parameter(name).units)
     size, units = unit_of(shown, name, units)
     return f"{name} = {value * size:.6g}{'' if units == '1' else f' {units}'}"
+
+
+def limit_of(result: xr.Dataset, given: Any) -> Limit | None:
+    """The checked limit of the amplitude; None if the system of ``result`` has no forced response."""
+    system = find_system(str(result.attrs.get("system")))
+    return Limit.of(system, given) if "forced" in system.models and system.displacements is not None else None
+
+
+def forced_motion(stability: xr.Dataset) -> xr.Dataset:
+    """The forced amplitudes at the points of a ``floquet`` result, without a value where it is not stable."""
+    scene = tomllib.loads(str(stability.attrs["scene"]))
+    found = run({**scene, "analysis": "forced", "outputs": ["amplitude"], "options": {}})
+    multipliers = abs(stability.get("floquet_multiplier", xr.DataArray(0.0)))
+    radius = stability.get("spectral_radius", multipliers.max([d for d in multipliers.dims if d == "multiplier"]))
+    grows = stability["verdict"] == 1 if "verdict" in stability else radius > 1
+    amplitude = found["amplitude"].where(~grows)
+    name = f"{amplitude.attrs['long_name']}, where stable"
+    return found.assign(amplitude=amplitude.assign_attrs(long_name=name))
