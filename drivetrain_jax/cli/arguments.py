@@ -103,7 +103,9 @@ _COMMANDS: dict[str, tuple[str, tuple[_Argument, ...]]] = {
             *_SCENE,
             _flag("--fresh", "compute all points again; replace result and unfinished work"),
             _value("--threads", "N", "number of threads (default: usable cores)", type=int),
-            _value("--workers", "N", "N Dask workers instead of threads, as --dask local:N; a worker may crash", type=int),
+            _value(
+                "--workers", "N", "N Dask workers instead of threads, as --dask local:N; a worker may crash", type=int
+            ),
             _value("--dask", "ADDRESS", "Dask cluster instead of threads: tcp://HOST:PORT or local:N"),
             _file(
                 "--reuse",
