@@ -26,6 +26,24 @@ from drivetrain_jax.store.parts import PartsFolder
 HDF5, ZARR = "hdf5", "zarr"
 
 
+# Endings of files of other kinds.
+_OTHER_FILES = {
+    ".csv",
+    ".html",
+    ".json",
+    ".mat",
+    ".npy",
+    ".npz",
+    ".pdf",
+    ".png",
+    ".svg",
+    ".toml",
+    ".txt",
+    ".xlsx",
+    ".zip",
+}
+
+
 class Output:
     """The result ``out`` and the folder of its parts, compared with the scene of ``job``.
 
@@ -56,6 +74,8 @@ class Output:
 
     def _check_folders(self) -> None:
         folder, parts = self.out.parent, self.parts.path
+        if self.out.suffix.lower() in _OTHER_FILES:
+            raise self._error("a result is a netCDF file; allowed is a name that ends in .nc")
         try:
             if not folder.is_dir():
                 raise self._error(f"the folder {str(folder)!r} does not exist; allowed is a file in an existing folder")

@@ -128,6 +128,8 @@ def export(store: Path, out: Path) -> int:
     Raises :class:`InputError` if ``store`` is not a sound Zarr store, or if ``out`` exists, and :class:`RetryableError`
     after an I/O error.
     """
+    if out.suffix.lower() == ".csv":
+        raise InputError(f"FILE.nc = {str(out)!r}: allowed is a name in .nc; a table is written by --csv {out}")
     if not zarr_store.is_store(store):
         raise InputError(f"store = {str(store)!r}: not a Zarr store; give one of `drivetrain run --store zarr`")
     parts = PartsFolder(out)

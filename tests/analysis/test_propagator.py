@@ -190,8 +190,7 @@ def test_batch_and_structural_zeros():
     for count in (1, 7, 32, 71):
         frequency = np.linspace(0.5, 3.0, count)
         c, s = np.cos(1.3 * frequency), np.sin(1.3 * frequency)
-        # In units of the states in which rows and columns have the same size.
-        exact = np.moveaxis(np.array([[c, s], [-s, c]]), -1, 0)
+        exact = np.moveaxis(np.array([[c, s / frequency], [-frequency * s, c]]), -1, 0)
         for function in (one, closed):
             np.testing.assert_allclose(jax.vmap(function)(frequency), exact, rtol=0, atol=1e-12)
     np.testing.assert_allclose(one(frequency[-1]), exact[-1], rtol=0, atol=1e-12)

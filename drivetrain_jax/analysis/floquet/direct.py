@@ -144,6 +144,7 @@ def compare(
     magnitudes = jax.tree.map(lambda x: abs(x) if isinstance(x, int | float) else jnp.abs(x), ends)
     size = stored(partial(assemble, magnitudes))(jnp.abs(fine.matrix))
     scales = stored(_balance)(size)
+    plain = z_fine, z_fine - z_coarse
     z_fine, z_coarse, size = (stored(_scaled)(matrix, scales) for matrix in (z_fine, z_coarse, size))
     norm = jnp.sqrt(square_sum(size))
     a_fine, slopes = stored(characteristic_polynomial)(z_fine)
@@ -171,4 +172,6 @@ def compare(
     of_entries = _ENTRIES * fine.stiffness * (halves * np.finfo(float).eps + jnp.minimum(fine.squared, 1.0) * unit)
     rounding = of_products + of_entries
     met = truncation <= jnp.maximum(rtol, rounding)
-    return Monodromy(z_fine, log_scale, truncation + rounding, met, residual, (4 / (gain - 1)) * apart)
+    # The propagator itself keeps the units of its states.
+    matrix, change = plain if ends is None else (z_fine, apart)
+    return Monodromy(matrix, log_scale, truncation + rounding, met, residual, (4 / (gain - 1)) * change)
