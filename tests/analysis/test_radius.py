@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivetrain_jax.analysis.floquet.radius import has_closed_form, radius_by_eigenvalues, radius_in_closed_form
+from drivetrain_jax.analysis.floquet.results import has_closed_form, radius_by_eigenvalues, radius_in_closed_form
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
 from tests.quick_jit import quick_jit
 

@@ -1,24 +1,121 @@
 """Derivatives of Floquet multipliers by the parameters of a system, by the adjoint of the collocation.
 
 A simple multiplier s of ``Z`` moves by ``ds = tr(B dZ) / p'(s)``, where ``p(s) = det(s I - Z)`` and B is the adjugate of
-``s I - Z``. The gradient of ``sum(W * Z)`` for given weights W costs about as much for many parameters as for one
-(:mod:`~drivetrain_jax.analysis.floquet.adjoint`).
+``s I - Z``. The gradient of ``sum(W * Z)`` for given weights W costs about as much for many parameters as for one, by the
+discrete adjoint of the march.
+
+With the propagators ``P_k`` of the panels the change of ``sum(W * Phi)`` is the sum over k of
+``(P_K ... P_{k+1})^T W (P_{k-1} ... P_1)^T * dP_k``, entry by entry. The factors on the right are marched forwards and those
+on the left backwards; states are kept on two levels.
+
+A panel is ``P = P0 + B M^(-1) R``. With the unknowns ``X = M^(-1) R`` of unit states, the multipliers ``L = (B M^(-1))^T W``
+and the stage values ``V_t`` that the coefficients ``E_t`` multiply, ``dP = B M^(-1) sum_t dE_t V_t``: the gradient of
+``sum(W * P)`` by ``E_t`` at a node is ``L V_t^T`` there. Gauss schemes are self-adjoint, so L is the same scheme's solution
+of the adjoint equation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax.analysis.floquet.adjoint import Build, direct_form, propagators, weighted_gradient
 from drivetrain_jax.analysis.floquet.direct import assemble
 from drivetrain_jax.analysis.floquet.multipliers import sort_multipliers
-from drivetrain_jax.analysis.numerics.lanes import Constants
-from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
+from drivetrain_jax.analysis.floquet.propagator import Panels
+from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last
+from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, matmul
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic
+
+# States kept on each of two levels, 130,000 panels in all, and lanes per block.
+_KEPT, _LANES = 360, 32
+
+Build = Callable[[Any], FloquetModel]
+
+
+def direct_form(build: Build, parameters: Any, constants: Constants) -> LinearPeriodic:
+    """The marched form of the system with these ``parameters`` (arrays) and ``constants`` (all else)."""
+    return build(eqx.combine(parameters, constants.tree)).direct
+
+
+def propagators(build: Build, parameters: Any, constants: Constants, count: Array) -> Array:
+    """The propagators of one point between its breakpoints, in ``count`` panels each, ``(parts, n, n)``."""
+    return lanes_last(_marched, Constants((build, constants)), parameters, count, _LANES)
+
+
+def _marched(fixed: Constants, parameters: Any, count: Array) -> Array:
+    build, constants = fixed.tree
+    form = direct_form(build, parameters, constants)
+    lanes = max((x.shape[-1] for x in jax.tree.leaves(parameters) if x.ndim), default=1)
+    unit = jnp.broadcast_to(jnp.eye(form.size)[..., None], (form.size, form.size, lanes))
+
+    def through(part: LinearPeriodic) -> Array:
+        panels = Panels(part)
+        return jax.lax.fori_loop(0, count, lambda k, y: matmul(panels.propagator(panels.fixed, count, k), y), unit)
+
+    return jnp.stack([through(part) for part in form.parts])
+
+
+def weighted_gradient(
+    build: Build, parameters: Any, constants: Constants, number: int, before: Array, weights: Array, count: Array
+) -> Any:
+    """The gradient ``(F,)`` of ``sum(weights * (Phi before))`` by each parameter, in ``count`` panels.
+
+    Phi is the propagator of the part ``number`` between breakpoints; ``before`` is ``(n, n)`` and ``weights`` ``(F, n, n)``.
+    """
+    fixed = Constants((build, constants, number))
+    return lanes_last(_pulled, fixed, (parameters, before, weights), count, _LANES)
+
+
+def _pulled(fixed: Constants, given: tuple[Any, Array, Array], count: Array) -> Any:
+    """The :func:`weighted_gradient` of all lanes, which are the last axis of each array."""
+    parameters, before, weights = given
+    lanes = max(x.shape[-1] for x in jax.tree.leaves(given) if x.ndim)
+    parameters = jax.tree.map(lambda x: jnp.broadcast_to(x, lanes), parameters)
+    before, weights = (jnp.broadcast_to(x, (*x.shape[:-1], lanes)) for x in (before, weights))
+    build, constants, number = fixed.tree
+    long = -(-count // _KEPT)
+    short = -(-count // long)
+    count = long * short
+
+    def panel(k: Array, parameters: Any) -> Array:
+        panels = Panels(direct_form(build, parameters, constants).parts[number])
+        return panels.propagator(panels.fixed, count, k)
+
+    def onward(start: Array, length: Array, y: Array) -> Array:
+        return jax.lax.fori_loop(start, start + length, lambda k, y: matmul(panel(k, parameters), y), y)
+
+    def interval(step: Array, carry: tuple[Array, Any, Array]) -> tuple[Array, Any, Array]:
+        """First the states before the long intervals; then, for each of these from the last, before its panels."""
+        kept, gradient, weights = carry
+        first = step == 0
+        level, k = jnp.where(first, 0, 1), jnp.where(first, 0, long - step)
+        number, length = jnp.where(first, long, short), jnp.where(first, short, 1)
+
+        def forwards(i: Array, kept: Array) -> Array:
+            return kept.at[level, i + 1].set(onward(k * short + i * length, length, kept[level, i]))
+
+        def back(j: Array, carry: tuple[Any, Array]) -> tuple[Any, Array]:
+            i = short - 1 - j
+            matrix, pull = jax.vjp(partial(panel, k * short + i), parameters)
+            own = jnp.sum(carry[1][:, :, None] * kept[1, i][None, None], axis=3)
+            (more,) = jax.vmap(pull)(own)
+            earlier = jax.vmap(matmul, (None, 0))(jnp.swapaxes(matrix, 0, 1), carry[1])
+            return jax.tree.map(jnp.add, carry[0], more), earlier
+
+        kept = jax.lax.fori_loop(0, number - 1, forwards, kept.at[level, 0].set(kept[0, k]))
+        gradient, weights = jax.lax.fori_loop(0, jnp.where(first, 0, short), back, (gradient, weights))
+        return kept, gradient, weights
+
+    kept = jnp.zeros((2, _KEPT, *before.shape)).at[0, 0].set(before)
+    none = jax.tree.map(lambda x: jnp.zeros((len(weights), *x.shape)), parameters)
+    return jax.lax.fori_loop(0, long + 1, interval, (kept, none, weights))[1]
+
 
 # Relative difference below which two moduli are equal up to rounding, as all moduli are without damping.
 TIED = 1e-11
