@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drivetrain_jax.analysis.floquet import adjoint
+from drivetrain_jax.analysis.floquet import derivatives
 from drivetrain_jax.analysis.floquet.derivatives import monodromy
 from drivetrain_jax.analysis.numerics import lanes
 from drivetrain_jax.analysis.numerics.lanes import Constants
@@ -29,7 +29,7 @@ def test_two_levels_of_kept_states_give_what_one_gives(monkeypatch):
     build = get_system("cardan").models["floquet"].build
     weights = jnp.asarray(np.random.default_rng(0).normal(size=(2, 4, 4)))
     once = quick_jit(lambda: gradients(build, SHAFT, 9, weights))()
-    monkeypatch.setattr(adjoint, "_KEPT", 3)
+    monkeypatch.setattr(derivatives, "_KEPT", 3)
     lanes._trace.cache_clear()
     again = quick_jit(lambda: gradients(build, SHAFT, 9, weights))()
     np.testing.assert_allclose(again, once, rtol=1e-11)

@@ -20,6 +20,7 @@ def test_free_vibration_loses_energy_in_contact_only():
     np.testing.assert_allclose(dt.history(gears, times=[0.2, 1.0]).u, [-0.939, 0.365], atol=5e-4)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("omega", "multiple"), [(0.7, 1), (0.45, 2)])
 def test_multipliers_and_derivatives_are_those_of_the_motion(omega, multiple):
     """Against differences of the exact motion over a period, with contact on both flanks and on one."""

@@ -222,7 +222,7 @@ WRONG = {
     "result that this system lacks": (
         {"system": "cardan", "analysis": "floquet", "outputs": ["floquet_exponents"]},
         "'floquet_exponents'",
-        "allowed is floquet_multiplier, spectral_radius,",
+        "allowed is floquet_multiplier, floquet_multiplier_error, spectral_radius,",
     ),
     "method that this system lacks": (
         {"system": "tripod", "analysis": "floquet", "options": {"method": "magic"}},
