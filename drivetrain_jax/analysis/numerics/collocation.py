@@ -197,7 +197,12 @@ def panel(scheme: Scheme, coefficients: Sequence[Array]) -> Array:
         found = factors(scheme, coefficients)
         return panel_propagator(scheme, found, coefficients[0].shape[1]), found
 
-    propagator.defvjp(forward, lambda found, weights: (tuple(_by_coefficients(scheme, found, weights)),))
+    def backward(found: Factors, weights: Array) -> tuple[tuple[Array, ...]]:
+        slopes = zip(_by_coefficients(scheme, found, weights), coefficients, strict=True)
+        # Coefficients that all lanes share.
+        return (tuple(jnp.sum(x, -1, keepdims=True) if e.shape[-1] == 1 else x for x, e in slopes),)
+
+    propagator.defvjp(forward, backward)
     return propagator(tuple(coefficients))
 
 
