@@ -17,8 +17,8 @@ from drivetrain_jax.runs.assemble import PENDING, labelled, missing_value, templ
 from drivetrain_jax.runs.job import Job, Results
 from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import restore_scene, result_variables
-from drivetrain_jax.store import zarr_store
-from drivetrain_jax.store.consolidate import ResultFile, release
+from drivetrain_jax.store import checksums, zarr_store
+from drivetrain_jax.store.consolidate import ResultFile, read_attribute, release
 from drivetrain_jax.store.files import flush_tree, move_folder
 from drivetrain_jax.store.parts import PartsFolder
 from drivetrain_jax.store.schema import Labelled
@@ -132,13 +132,18 @@ def export(store: Path, out: Path) -> int:
         raise InputError(f"FILE.nc = {str(out)!r}: allowed is a name in .nc; a table is written by --csv {out}")
     if not zarr_store.is_store(store):
         raise InputError(f"store = {str(store)!r}: not a Zarr store; give one of `drivetrain run --store zarr`")
-    parts = PartsFolder(out)
-    if out.exists() or not out.parent.is_dir() or parts.holds_work():
-        raise InputError(f"out = {str(out)!r}: allowed is a new file in an existing folder, without unfinished work")
     if not zarr_store.is_sealed(store):
         raise _damaged(store, "its attributes are damaged, or it is not finished")
-    attrs = zarr_store.attributes(store)
+    attrs, parts = zarr_store.attributes(store), PartsFolder(out)
     scene = restore_scene(attrs["scene"])
+    points = math.prod(Grid.of(scene).result_shape)
+    if parts.path.is_dir() and _is_copy(out, attrs["digest"]):
+        # An export that was killed after it had moved its file into place.
+        parts.open()
+        parts.close(remove=True)
+        return points
+    if out.exists() or not out.parent.is_dir() or parts.holds_work():
+        raise InputError(f"out = {str(out)!r}: allowed is a new file in an existing folder, without unfinished work")
     kept = {name: value for name, value in attrs.items() if name not in (zarr_store.SEAL, "coordinates")}
     shapes, shards = zarr_store.result_shapes(store), zarr_store.shards_of(store)
     zeros = {v.name: np.broadcast_to(np.zeros((), v.dtype), shapes[v.name]) for v in result_variables(scene)}
@@ -158,7 +163,14 @@ def export(store: Path, out: Path) -> int:
         raise RetryableError(f"out = {str(out)!r}: {error}; the same command tries again") from None
     finally:
         parts.close(remove=True)
-    return math.prod(Grid.of(scene).result_shape)
+    return points
+
+
+def _is_copy(out: Path, digest: str) -> bool:
+    try:
+        return out.is_file() and read_attribute(out, "digest") == digest and checksums.damaged(out) == []
+    except InputError:
+        return False
 
 
 def _damaged(store: Path, what: str) -> InputError:

@@ -182,6 +182,16 @@ def test_damaged_attributes_of_a_growing_store_are_replaced(grid_scene, tmp_path
     assert opened(tmp_path / "e.nc").equals(dt.run(scene))
 
 
+def test_an_export_killed_at_its_end_is_complete(grid_scene, tmp_path):
+    store, path = tmp_path / "r.zarr", tmp_path / "r.nc"
+    run_to_file(grid_scene, store)
+    export(store, path)
+    (tmp_path / "r.nc.parts").mkdir()
+    assert export(store, path) == 123 and sorted(x.name for x in tmp_path.iterdir()) == ["r.nc", "r.zarr"]
+    with pytest.raises(InputError, match="allowed is a new file"):
+        export(store, path)
+
+
 def test_export_leaves_unfinished_work_alone(grid_scene, tmp_path):
     to_store(ONE, tmp_path / "r.zarr")
     with pytest.raises(Interrupted):
