@@ -131,7 +131,7 @@ def test_bound_counts_rounding_that_both_step_sizes_share(direct, rtol):
     found = direct({"beta": beta, "Omega": omega, **shaft, "gamma": 0.9443277346781929}, rtol=rtol)
     error = np.abs(found["spectral_radius"] - exact)
     assert (error <= found["spectral_radius_error"]).all(), error / found["spectral_radius_error"]
-    assert (found["spectral_radius_error"] <= 5e-11 + 10 * rtol).all()
+    assert (found["spectral_radius_error"] <= 6e-11 + 10 * rtol).all()
     assert found["verdict"].tolist() == [STABLE, UNDECIDED, UNDECIDED]
 
 
@@ -341,7 +341,7 @@ def test_only_what_is_asked_for_is_returned(method, outputs):
         shapes = jax.eval_shape(solver.solve, values, jax.ShapeDtypeStruct((), np.int64))
         assert set(shapes) == {*outputs, "outcome"}
         for name, shape in shapes.items():
-            assert shape.shape == ((4,) if name == "floquet_multiplier" else ())
+            assert shape.shape == ((4,) if name.startswith("floquet_multiplier") else ())
             assert shape.dtype == {"floquet_multiplier": complex, "verdict": np.int8, "outcome": np.int8}.get(
                 name, float
             )
