@@ -147,5 +147,5 @@ def test_bounds_and_verdicts(kind, n, count):
         radius, bound = (found[name].astype(np.longdouble) for name in OUTPUTS[:2])
         worst = np.nanmax(np.abs(radius - exact) / bound)
         assert worst <= 1, (rtol, worst, np.nanargmax(np.abs(radius - exact) / bound))
-        assert np.isfinite(radius).mean() > 0.99 and np.median(bound / radius) < 1e-4 * rtol**0.5
+        assert np.isfinite(radius).mean() > 0.99 and np.median(bound / radius) < 1e-3 * rtol**0.5
         assert not np.any((found["verdict"] == 0) & (exact > 1)) and not np.any((found["verdict"] == 1) & (exact < 1))
