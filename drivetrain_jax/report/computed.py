@@ -1,4 +1,4 @@
-"""What a report computes: answers and chart of an atlas, and the forced motion at the points of a stability result."""
+"""The computations of a report: answers and chart of an atlas, and the forced motion at the points of a stability result."""
 
 from __future__ import annotations
 

@@ -24,24 +24,8 @@ from drivetrain_jax.store.files import behind_link, move_folder
 from drivetrain_jax.store.parts import PartsFolder
 
 HDF5, ZARR = "hdf5", "zarr"
-
-
 # Endings of files of other kinds.
-_OTHER_FILES = {
-    ".csv",
-    ".html",
-    ".json",
-    ".mat",
-    ".npy",
-    ".npz",
-    ".pdf",
-    ".png",
-    ".svg",
-    ".toml",
-    ".txt",
-    ".xlsx",
-    ".zip",
-}
+_FOREIGN = {".csv", ".html", ".json", ".mat", ".npy", ".npz", ".pdf", ".png", ".svg", ".toml", ".txt", ".xlsx", ".zip"}
 
 
 class Output:
@@ -74,7 +58,7 @@ class Output:
 
     def _check_folders(self) -> None:
         folder, parts = self.out.parent, self.parts.path
-        if self.out.suffix.lower() in _OTHER_FILES:
+        if self.out.suffix.lower() in _FOREIGN:
             raise self._error("a result is a netCDF file; allowed is a name that ends in .nc")
         try:
             if not folder.is_dir():

@@ -98,7 +98,7 @@ def test_bounds_hold_where_solutions_grow_within_the_period(method):
 
 
 def test_a_multiplier_below_its_error_is_not_known():
-    """x'' = 25 x + 0 cos 2t: the multipliers are exp(+-5 pi), and for 121 the smaller one is below the rounding."""
+    """x'' = 25 x: of the multipliers exp(+-5 pi) the smaller one is below the rounding, that of x'' = 4 x is not."""
     outputs = ["floquet_multiplier", "floquet_multiplier_error", "spectral_radius"]
     found = jax.vmap(lambda a: dt.floquet(Mathieu(a=a, q=0.0), outputs=outputs))(np.array([-4.0, -25.0, -121.0]))
     exact = np.exp(math.pi * np.array([[2.0, -2.0], [5.0, -5.0], [11.0, -11.0]]))
@@ -107,6 +107,12 @@ def test_a_multiplier_below_its_error_is_not_known():
     assert np.all((error <= found.floquet_multiplier_error) | np.isnan(error)) and found.outcome.tolist() == [0] * 3
     assert np.all(error[:, 0] <= 1e-9 * exact[:, 0])
     assert np.array_equal(np.isnan(found.floquet_multiplier_error), np.isnan(error))
+    turning = dt.floquet(Mathieu(a=2.0, q=0.0), outputs=outputs)
+    angle = math.sqrt(2) * math.pi - 2 * math.pi
+    assert (
+        np.abs(turning.floquet_multiplier - np.exp([1j * angle, -1j * angle])).max()
+        <= turning.floquet_multiplier_error[0]
+    )
 
 
 @pytest.mark.full

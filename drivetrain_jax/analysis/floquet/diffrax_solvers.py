@@ -90,7 +90,7 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
 
 
 def _records(build: Build, values: Mapping[str, Any], panels: Array, natural: bool = False) -> Propagator:
-    """How errors grow in one point, whatever method makes them: by the march of ``direct``."""
+    """The growth of errors in one point, whatever method makes them, by the march of ``direct``."""
     model = build(values)
     return march(model.natural if natural else model.reduced, panels).in_units_of(jnp.zeros(()))
 

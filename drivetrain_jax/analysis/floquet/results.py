@@ -118,22 +118,29 @@ def lacks(system: type[System]) -> dict[str, str]:
     return {"floquet_exponent": f"a rate in 1/s, and the time of {system.name} has no unit"}
 
 
-def _of_multipliers(z: Monodromy, finite: Array, spectrum: Spectrum, system: LinearPeriodic) -> dict[str, Array]:
+def _of_multipliers(
+    z: Monodromy, finite: Array, bounded: Array, spectrum: Spectrum, system: LinearPeriodic
+) -> dict[str, Array]:
     """Multipliers with their errors and exponents; NaN where the error exceeds the multiplier.
 
+    ``bounded`` ones are known to lie on the unit circle: there the error of the modulus is gone, and the distance from the
+    nearest point of the circle is at most twice the error.
     As eigenvalues small multipliers have the absolute errors of large ones. The smaller one of two follows from their
     product, if that is known, where the moduli differ by more than a factor of two.
     """
     multipliers = jnp.where(finite, sort_multipliers(*spectrum), jnp.nan)
     errors = multiplier_errors(multipliers.real, multipliers.imag, z.error)
+    multipliers = jnp.where(bounded, jnp.exp(-z.log_scale) * multipliers / jnp.abs(multipliers), multipliers)
+    errors = jnp.where(bounded, 2.0, 1.0) * errors
     logarithms = jnp.log(jnp.abs(multipliers))
     if len(multipliers) == 2 and system.log_determinant is not None:
         log_product = system.log_determinant() - 2 * z.log_scale
-        apart = (jnp.arange(2) == 1).reshape(2, *(1,) * (multipliers.ndim - 1)) & (
-            logarithms[0] - logarithms[1] > math.log(2)
-        )
+        smaller = (jnp.arange(2) == 1).reshape(2, *(1,) * (multipliers.ndim - 1))
+        apart = smaller & (logarithms[0] - logarithms[1] > math.log(2))
         other = jnp.exp(log_product) / multipliers[0]
-        errors = jnp.where(apart, errors[0] / jnp.abs(multipliers[0]) * jnp.abs(other), errors)
+        # The last term is the rounding of the logarithm.
+        relative = errors[0] / jnp.abs(multipliers[0]) + np.finfo(float).eps * (4 + jnp.abs(log_product))
+        errors = jnp.where(apart, relative * jnp.abs(other), errors)
         multipliers = jnp.where(apart, other, multipliers)
         logarithms = jnp.where(apart, log_product - logarithms[0], logarithms)
     size, known = jnp.exp(z.log_scale), errors < jnp.abs(multipliers)
@@ -180,9 +187,7 @@ def results(
     rho, error = jnp.where(bounded, 1 / size, rho), jnp.where(bounded, _ROUNDING / size, error)
     found: dict[str, Array] = {}
     if spectrum and wanted & MULTIPLIERS:
-        # On the circle without the error of the moduli.
-        length = jnp.where(bounded, size * jnp.hypot(*spectrum), 1.0)
-        found = _of_multipliers(z, finite, (spectrum[0] / length, spectrum[1] / length), model.natural)
+        found = _of_multipliers(z, finite, bounded, spectrum, model.natural)
     found |= {"spectral_radius": rho * size, "liouville_residual": jnp.where(finite, z.residual, jnp.nan)}
     met = z.met
     if wanted & NEED_ERROR:
