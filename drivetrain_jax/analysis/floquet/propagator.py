@@ -221,7 +221,7 @@ def _agreeing(
         missed = (fine.stiffness > _RESOLVED * count) & (fine.decay < fine.stiffness)
         undamped = jnp.where(fine.decay > 0, -_UNDAMPED * (1.0 * count) ** 2 / fine.decay, -jnp.inf)
         fine = fine._replace(undamped=jnp.where(missed, jnp.inf, undamped))
-        # Half as many panels may not show the order yet, unless the system predicts how many it needs.
+        # Half as many panels may not show the order yet, unless the system predicts how many it needs: count on less.
         gain = jnp.where(number == 1, count / first, 2.0) ** jnp.where(ratio > 2, ORDER, ORDER - 3)
         found = jax.lax.cond(
             number > 0, lambda: compare(ends, determinant, coarse, fine, len(marches) * count, gain, rtol), lambda: none
@@ -245,7 +245,7 @@ def _any(flags: Array) -> Array:
 
 
 class _State(NamedTuple):
-    """``exp(log_scale) matrix`` at a time t, with two records of the march so far.
+    """``exp(log_scale) matrix`` at a time t, with three records of the march so far.
 
     ``covariance`` is that of errors at t which were made at the ends of all panels: independent, and in each row as large as
     the terms of its products. With the propagator P of a panel it obeys ``C' = P C P^T + D``, where D is the diagonal of
