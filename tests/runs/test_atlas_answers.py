@@ -55,8 +55,9 @@ def test_an_atlas_answers_with_multipliers_as_well():
     reply = atlas_answers.query(stored_atlas(scene), {"beta": 0.3, "Omega": 1.416})
     expected = dt.point("cardan", "floquet", beta=0.3, Omega=1.416, outputs="floquet_multiplier", **fixed)
     found = json.loads(reply.to_json())["values"]["floquet_multiplier"]
-    np.testing.assert_allclose([z["real"] + 1j * z["imag"] for z in found], expected.floquet_multiplier, rtol=1e-8)
-    assert str(reply).splitlines()[1].split()[1] == f"{found[0]['real']:.12g}{found[0]['imag']:+.12g}j,"
+    multipliers = np.array(found["real"]) + 1j * np.array(found["imag"])
+    np.testing.assert_allclose(multipliers, expected.floquet_multiplier, rtol=1e-8)
+    assert str(reply).splitlines()[1].split()[1] == f"{multipliers[0].real:.12g}{multipliers[0].imag:+.12g}j,"
 
 
 def atlas_of(*given, **more) -> StoredAtlas:
