@@ -91,11 +91,10 @@ def scene(cells: int) -> dict[str, Any]:
 def package_jobs(cells: int, folder: Path) -> dict[str, Callable[[], Any]]:
     """The warm times of the package."""
     import drivetrain_jax as dt
-    from drivetrain_jax.runs.executors import Threads
-    from drivetrain_jax.runs.rounds import build_atlas
     from drivetrain_jax.runs.run import run_to_file
     from drivetrain_jax.runs.scene import load_scene
-    from drivetrain_jax.runs.work import Progress, Work
+    from drivetrain_jax.runs.through_atlas import build_atlas
+    from drivetrain_jax.runs.work import Progress, Threads, Work
 
     grid, given = axes(cells), scene(cells)
     ranges = {name: (float(x[0]), float(x[-1])) for name, x in grid.items()}

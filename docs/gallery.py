@@ -25,8 +25,8 @@ from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.cli.progress import progress_line
 from drivetrain_jax.datasets.figure import table
 from drivetrain_jax.runs.atlas_chart import chart
+from drivetrain_jax.runs.output import status
 from drivetrain_jax.runs.run import Incomplete, run_to_file
-from drivetrain_jax.runs.status import status
 from drivetrain_jax.store.consolidate import open_result
 from drivetrain_jax.systems import get_system, system_names
 

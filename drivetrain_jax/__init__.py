@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     from drivetrain_jax.datasets.figure import plot
     from drivetrain_jax.functions import Result
     from drivetrain_jax.runs.atlas_file import open_atlas
+    from drivetrain_jax.runs.output import open_result
     from drivetrain_jax.runs.over import sweep
     from drivetrain_jax.runs.point import point
     from drivetrain_jax.runs.run import Incomplete, Interrupted, run
-    from drivetrain_jax.runs.status import open_result
     from drivetrain_jax.systems.bicardan import Bicardan
     from drivetrain_jax.systems.cardan import Cardan
     from drivetrain_jax.systems.planetary import Planetary
@@ -49,7 +49,7 @@ _HOME = {
     "datasets.figure": ("plot",),
     "runs.atlas_file": ("open_atlas",),
     "runs.over": ("sweep",),
-    "runs.status": ("open_result",),
+    "runs.output": ("open_result",),
     "runs.point": ("point",),
     "runs.run": ("Incomplete", "Interrupted", "run"),
     "systems.bicardan": ("Bicardan",),

@@ -12,7 +12,7 @@ from typing import Any
 from filelock import FileLock
 
 import drivetrain_jax as dt
-from drivetrain_jax.runs.status import status
+from drivetrain_jax.runs.output import status
 
 FOLDER = Path(__file__).parents[1] / ".pytest_cache" / "atlases"
 

@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).parent / "faults"))
 from page import PAGE, write
 
 from drivetrain_jax._machine import machine
-from drivetrain_jax.store.provenance import now
+from drivetrain_jax.store.files import now
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

@@ -94,15 +94,15 @@ def _tabulated(options: argparse.Namespace) -> dict[str, Any]:
     """The values of the table ``--data``."""
     if options.data is None:
         return {}
-    from drivetrain_jax.runs.data_table import read_table
+    from drivetrain_jax.runs.physical import read_table
 
     return read_table(options.data)
 
 
 def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[Any, int, str]:
     """Counts, exit code, and the message for the user."""
-    from drivetrain_jax.runs.executors import make_executor
     from drivetrain_jax.runs.run import Incomplete, run_to_file
+    from drivetrain_jax.runs.work import make_executor
 
     overrides = _overrides(options)
     with _progress_line(options.quiet) as show:
@@ -132,7 +132,7 @@ def _remarks(progress: Any, out: Path) -> str:
     """The note of a finished run, and its values that miss the tolerance."""
     remarks = [progress.note] if progress.note else []
     if progress.inaccurate:
-        from drivetrain_jax.runs.status import missed
+        from drivetrain_jax.runs.output import missed
 
         remarks.append(missed(out, progress.inaccurate, progress.total))
     return "; ".join(remarks)
@@ -148,7 +148,7 @@ def _progress_line(quiet: bool) -> Any:
 
 def status(options: argparse.Namespace) -> int:
     """Print how much of a scene is computed."""
-    from drivetrain_jax.runs.status import status
+    from drivetrain_jax.runs.output import status
 
     return _answer(status(options.scene, options.out, _overrides(options)), options)
 

@@ -129,9 +129,9 @@ def _opened(path: Path) -> xr.Dataset:
         refuse_damaged(path)
         return open_result(path)
     # Local import: the module imports jax, which a complete result does not need.
-    from drivetrain_jax.runs import status
+    from drivetrain_jax.runs import output
 
-    return status.open_result(path)
+    return output.open_result(path)
 
 
 def _chart(

@@ -14,12 +14,12 @@ import drivetrain_jax
 from drivetrain_jax._machine import machine
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome
+from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.identity import PACKAGES
-from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import Problem, Scene, result_variables
-from drivetrain_jax.store import provenance
 from drivetrain_jax.store.consolidate import release
-from drivetrain_jax.store.schema import CONVENTIONS, Coordinate, Labelled
+from drivetrain_jax.store.files import command, now, versions
+from drivetrain_jax.store.netcdf import CONVENTIONS, Coordinate, Labelled
 from drivetrain_jax.systems import System
 
 if TYPE_CHECKING:
@@ -229,8 +229,8 @@ def result_attrs(scene: Scene) -> dict[str, str]:
         parameter = scene.system.parameter(name)
         fixed[name] = {"value": _finite(value), "units": parameter.units, "long_name": parameter.long_name}
     installed, created, version = (
-        provenance.versions((*PACKAGES, *_STORAGE)),
-        provenance.now(),
+        versions((*PACKAGES, *_STORAGE)),
+        now(),
         drivetrain_jax.__version__,
     )
     cited = {"references": scene.system.source} if scene.system.source else {}
@@ -238,7 +238,7 @@ def result_attrs(scene: Scene) -> dict[str, str]:
         "Conventions": CONVENTIONS,
         "title": scene.title,
         "source": f"drivetrain_jax {version}",
-        "history": f"{created}: {provenance.command()}",
+        "history": f"{created}: {command()}",
         **cited,
         "system": scene.system.name,
         "roles": json.dumps(_roles(scene)),

@@ -27,10 +27,10 @@ from drivetrain_jax.atlas.windows import narrow
 from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, check_same, open_atlas
 from drivetrain_jax.runs.axes import in_unit
 from drivetrain_jax.runs.identity import program_identity
+from drivetrain_jax.runs.kernel import remembered
 from drivetrain_jax.runs.physical import in_parameters
-from drivetrain_jax.runs.programs import remembered
 from drivetrain_jax.runs.scene import find_system
-from drivetrain_jax.store.provenance import source_digest
+from drivetrain_jax.store.files import source_digest
 from drivetrain_jax.systems import System
 
 Convert = Callable[[Any], Any]

@@ -20,21 +20,18 @@ from drivetrain_jax.analysis.request import make_request
 from drivetrain_jax.atlas import StabilityAtlas, from_arrays, stability_atlas, to_arrays
 from drivetrain_jax.atlas.floquet import floquet_domain
 from drivetrain_jax.runs.assemble import ResultBuffer, labelled, result_attrs, to_dataset
-from drivetrain_jax.runs.atlas_choice import atlas_ranges
 from drivetrain_jax.runs.axes import Axis
-from drivetrain_jax.runs.executors import Threads
 from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.kernel import kept
 from drivetrain_jax.runs.physical import in_parameters
-from drivetrain_jax.runs.programs import kept
 from drivetrain_jax.runs.reuse import ReusedPoints
-from drivetrain_jax.runs.rounds import build_atlas
-from drivetrain_jax.runs.scene import Scene, restore_scene
-from drivetrain_jax.runs.through_atlas import evaluate
-from drivetrain_jax.runs.work import DIRECT, Progress, Route, Work
+from drivetrain_jax.runs.scene import Scene, atlas_ranges, restore_scene
+from drivetrain_jax.runs.through_atlas import build_atlas, evaluate
+from drivetrain_jax.runs.work import DIRECT, Progress, Route, Threads, Work
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.consolidate import open_result, read_plain, write_result
 from drivetrain_jax.store.files import ATLAS_PREFACE
-from drivetrain_jax.store.schema import Entry, Labelled
+from drivetrain_jax.store.netcdf import Entry, Labelled
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -9,7 +9,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter, Variable
 from drivetrain_jax._wording import aligned, did_you_mean, nearest, written
 from drivetrain_jax.analysis import analyses_of, analysis_names, broken_analyses, get_analysis
-from drivetrain_jax.runs import shipped
+from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.runs.toml import entries
 from drivetrain_jax.systems import System, system_names
@@ -99,8 +99,8 @@ def _variable_row(variable: Variable, default: bool) -> tuple[str, ...]:
 def _scene_lines(system: type[System] | None) -> list[str]:
     """Scenes that the package brings, by name, and files of another ``sweeps/`` in the working folder."""
     here = Path("sweeps")
-    lines = _rows("Scenes (drivetrain run NAME computes one)", shipped.FOLDER, "{0.stem}", system)
-    if here.is_dir() and not here.samefile(shipped.FOLDER):
+    lines = _rows("Scenes (drivetrain run NAME computes one)", toml.FOLDER, "{0.stem}", system)
+    if here.is_dir() and not here.samefile(toml.FOLDER):
         lines += _rows("Scenes of this folder", here, "{0}", system)
     return lines
 

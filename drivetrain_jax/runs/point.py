@@ -17,10 +17,9 @@ from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_r
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.forced_limit import Limit
-from drivetrain_jax.runs.growth_text import growth_lines, growth_of, speed_in_rpm
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.physical import described
-from drivetrain_jax.runs.reply import Reply
+from drivetrain_jax.runs.reply import Reply, growth_lines, growth_of, speed_in_rpm
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import Scene, load_scene, system_and_analysis
 

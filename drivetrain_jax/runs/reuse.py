@@ -17,14 +17,13 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import sweep_first
-from drivetrain_jax.runs.axes import entry_of
-from drivetrain_jax.runs.explain import differences_of, not_valid
+from drivetrain_jax.runs.axes import Grid, entry_of
+from drivetrain_jax.runs.identity import differences_of, not_valid
 from drivetrain_jax.runs.job import Job
-from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import Scene, restore_scene, result_variables
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.consolidate import map_variable, read_attribute
-from drivetrain_jax.store.provenance import digest
+from drivetrain_jax.store.files import digest
 from drivetrain_jax.store.zarr_store import is_store
 
 # Points that are copied at a time.

@@ -35,6 +35,7 @@ from drivetrain_jax.runs.physical import described, with_parameters
 from drivetrain_jax.systems import Model, System, get_system, system_names
 
 Value = float | int | str | tuple[float, ...]
+Ranges = dict[str, tuple[float, float]]
 # Assumed length of a dimension that depends on the system.
 _USUAL_SIZE = 4
 # Name of the system that stands for a function in the scene of its sweep.
@@ -115,6 +116,17 @@ class Scene(Problem):
 def result_variables(problem: Problem) -> tuple[Variable, ...]:
     """The requested results, then the outcome."""
     return (*(problem.analysis.variable(name) for name in problem.request.outputs), OUTCOME)
+
+
+def atlas_ranges(scene: Scene) -> Ranges:
+    """Lowest and highest value of every parameter that varies, those with the fewest values first."""
+    parts = [part for axis in scene.axes for part in axis.together]
+    lengths = {part.name: len(part.values) for part in parts}
+    varying = [part for part in parts if part.values.min() < part.values.max()]
+    return {
+        part.name: (float(part.values.min()), float(part.values.max()))
+        for part in sorted(varying, key=lambda part: lengths[part.name])
+    }
 
 
 class _SceneTable(msgspec.Struct, forbid_unknown_fields=True):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -15,12 +15,14 @@ from drivetrain_jax.analysis.numerics.kernels import options_for_few
 from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.analysis.request import make_request
 from drivetrain_jax.atlas.windows import Crossing
-from drivetrain_jax.runs.atlas_question import AtlasQuery
 from drivetrain_jax.runs.identity import program_identity
+from drivetrain_jax.runs.kernel import compiled
 from drivetrain_jax.runs.physical import GivenData, described
-from drivetrain_jax.runs.programs import compiled
 from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.systems import System
+
+if TYPE_CHECKING:
+    from drivetrain_jax.runs.atlas_answers import AtlasQuery
 
 # Relative step of central differences of the conversions of physical data, and step at 0. Part of the largest effect below
 # which an effect is rounding.

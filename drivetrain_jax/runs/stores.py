@@ -14,14 +14,14 @@ import numpy as np
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.runs.assemble import PENDING, labelled, missing_value, template, with_pending
+from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.job import Job, Results
-from drivetrain_jax.runs.point_grid import Grid
 from drivetrain_jax.runs.scene import restore_scene, result_variables
 from drivetrain_jax.store import checksums, zarr_store
 from drivetrain_jax.store.consolidate import ResultFile, read_attribute, release
 from drivetrain_jax.store.files import flush_tree, move_folder
+from drivetrain_jax.store.netcdf import Labelled
 from drivetrain_jax.store.parts import PartsFolder
-from drivetrain_jax.store.schema import Labelled
 
 
 class BlockStore(Protocol):

@@ -16,10 +16,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
+import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._units import with_unit
-from drivetrain_jax._wording import nearest, shown
-from drivetrain_jax.runs import shipped
+from drivetrain_jax._wording import did_you_mean, nearest, shown
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -119,11 +119,11 @@ def _check(value: Any, field: str) -> None:
 def _text(path: Path) -> str:
     try:
         # Editors on Windows put a byte order mark first.
-        return shipped.scene_file(path).read_text("utf-8-sig")
+        return scene_file(path).read_text("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"scene = {str(path)!r}: not a text file in UTF-8") from None
     except OSError as error:
-        raise InputError(f"scene = {str(path)!r}: {error.strerror}; {shipped.remedy(path)}") from None
+        raise InputError(f"scene = {str(path)!r}: {error.strerror}; {remedy(path)}") from None
 
 
 def _replace(tree: dict[str, Any], key: str, value: Any) -> None:
@@ -229,3 +229,22 @@ def _value(value: Any) -> str:
     if isinstance(value, Sequence):
         return "[" + ", ".join(_value(entry) for entry in value) + "]"
     return repr(value)
+
+
+# In a checkout this is a link to the folder at the top; in a wheel it contains the files.
+FOLDER = Path(drivetrain_jax.__file__).parent / "sweeps"
+
+
+def names() -> list[str]:
+    """Names of these scenes, sorted."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def scene_file(source: Path) -> Path:
+    """The packaged file if ``source`` is the name of a scene and not of an existing file, else ``source``."""
+    return FOLDER / f"{source}.toml" if str(source) in names() and not source.is_file() else source
+
+
+def remedy(source: Path) -> str:
+    """The remedy for a ``source`` that cannot be read."""
+    return f"give the path of a scene file, or a name of `drivetrain list`{did_you_mean(str(source), names())}"

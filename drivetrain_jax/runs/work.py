@@ -1,26 +1,36 @@
-"""Find the blocks of a run among those of an earlier one, or compute and keep them."""
+"""Find the blocks of a run among those of an earlier one, or compute and keep them, by threads or Dask workers."""
 
 from __future__ import annotations
 
+import logging
+import re
 import time
-from collections.abc import Callable, Container, Iterator, Mapping
-from contextlib import closing
-from dataclasses import dataclass
+import uuid
+from collections import deque
+from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping
+from concurrent.futures import Future
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import islice
 from pathlib import Path
-from typing import Protocol
+from queue import SimpleQueue
+from typing import Any, Protocol
 
 import numpy as np
 
-from drivetrain_jax._errors import RetryableError
+from drivetrain_jax._errors import ChunkError, InputError, RetryableError
+from drivetrain_jax._machine import usable_cores
 from drivetrain_jax._quantities import FIRST_FAILURE
+from drivetrain_jax._threads import threads
+from drivetrain_jax._wording import shown
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import ResultBuffer, labelled
-from drivetrain_jax.runs.executors import Executor
-from drivetrain_jax.runs.job import Block, Job, Results
+from drivetrain_jax.runs.job import Block, Chunk, Job, Results
 from drivetrain_jax.runs.reuse import NO_REUSE, ReusedPoints
 from drivetrain_jax.runs.stores import BlockStore
 from drivetrain_jax.store.consolidate import ResultFile
-from drivetrain_jax.store.schema import Labelled
+from drivetrain_jax.store.netcdf import Labelled
 
 
 @dataclass
@@ -210,3 +220,281 @@ class Route:
 
 
 DIRECT = Route()
+
+
+# Most threads or processes, unless four a core are more.
+_MOST = 64
+# Tasks per worker: one is computed while the other waits, so no worker idles during writing.
+IN_FLIGHT = 2
+# Upper limits of queued chunks and of their bytes of results per thread: small chunks are computed faster than collected.
+_MOST_AHEAD, _BYTES_AHEAD = 32, 1 << 23
+
+# Seconds until a scheduler has answered. A busy one may answer late.
+_ANSWERED = 10.0
+_LOCAL = re.compile(r"local:([1-9]\d*)")
+# Loggers of Dask that report the death of a scheduler or worker; the run reports it in one line.
+_TALKATIVE = ("distributed", "tornado", "asyncio")
+
+# Blocks and their results in the order of completion.
+Finished = Generator[tuple[Block, Results | None], None, None]
+
+
+class Executor(Protocol):
+    """Computes blocks, without effect on the numbers; workers start on first use."""
+
+    def check(self) -> None:
+        """Raise :class:`InputError` if no scheduler answers at the address."""
+
+    def run(
+        self, job: Job, blocks: Iterable[Block], store: BlockStore | None, first: int, tick: Callable[[int], None]
+    ) -> Finished:
+        """Yield blocks and their results, which are also in the ``store``, if any, as number ``first`` + that of the block.
+
+        A worker that has stored the results yields the outcomes alone. Results are None for a block that killed every
+        process that computed it. Other failures are raised. ``tick`` is called with the number of points of every chunk that
+        this process computes. Blocks are drawn one by one. After the generator is closed (also by an interrupt) nothing
+        further is started.
+        """
+        ...
+
+    def close(self) -> None:
+        """End the workers."""
+
+
+class Threads(Executor):
+    """Threads of this process (default: one for each usable core), which share the chunks of a block."""
+
+    def __init__(self, count: int | None = None) -> None:
+        self._count = count
+
+    def run(
+        self, job: Job, blocks: Iterable[Block], store: BlockStore | None, first: int, tick: Callable[[int], None]
+    ) -> Finished:
+        """Yield blocks and their results; the chunks of the next block start before the last ones of a block end."""
+        empty = deque[_Open]()
+
+        def chunks() -> Iterator[tuple[_Open, int]]:
+            for block in blocks:
+                opened = _Open(block, job.plan(block))
+                job.prepare(opened.chunks)
+                if not opened.chunks:
+                    empty.append(opened)
+                yield from ((opened, position) for position in range(len(opened.chunks)))
+
+        def finished(opened: _Open) -> tuple[Block, Results]:
+            results = job.joined(opened.block, opened.chunks, opened.in_order())
+            if store is not None:
+                store.write(first + opened.block.number, results)
+            return opened.block, results
+
+        computed = run_threads(chunks(), lambda at: job.compute(at[0].chunks[at[1]]), self._count or usable_cores())
+        try:
+            for (opened, position), results in computed:
+                opened.results[position] = results
+                tick(opened.chunks[position].points.size)
+                if len(opened.results) == len(opened.chunks):
+                    yield finished(opened)
+                while empty:
+                    yield finished(empty.popleft())
+            while empty:
+                yield finished(empty.popleft())
+        finally:
+            computed.close()
+
+
+class _Open:
+    """A block in work: its chunks, and the results of those that are computed."""
+
+    def __init__(self, block: Block, chunks: tuple[Chunk, ...]) -> None:
+        self.block, self.chunks = block, chunks
+        self.results = dict[int, Results]()
+
+    def in_order(self) -> list[Results]:
+        return [self.results[position] for position in range(len(self.chunks))]
+
+
+def run_threads(
+    tasks: Iterable[Any], work: Callable[[Any], Results], count: int
+) -> Generator[tuple[Any, Results], None, None]:
+    """Yield results from ``count`` threads of this process; compiled code releases the interpreter's lock.
+
+    An exception of a task is raised here. After the iterator is closed (also by an interrupt) no further task starts;
+    running ones finish in the background, and their results are dropped.
+    """
+    pool = threads(count, "chunk")
+    remaining = iter(tasks)
+    running: dict[Future[Results], Any] = {}
+    finished: SimpleQueue[Future[Results]] = SimpleQueue()
+    ahead = IN_FLIGHT
+    try:
+        while True:
+            while len(running) < ahead * count and (task := next(remaining, None)) is not None:
+                future = pool.submit(work, task)
+                running[future] = task
+                future.add_done_callback(finished.put)
+            if not running:
+                return
+            future = finished.get()
+            results = future.result()
+            ahead = _ahead(results)
+            yield running.pop(future), results
+    finally:
+        if running:
+            for future in running:
+                future.cancel()
+            # The next user of the pool must not wait for running tasks.
+            threads.cache_clear()
+
+
+def _ahead(results: Results) -> int:
+    """Number of tasks like that of ``results`` to queue per thread."""
+    size = sum(values.nbytes for values in results.values())
+    return min(max(_BYTES_AHEAD // max(size, 1), IN_FLIGHT), _MOST_AHEAD)
+
+
+class Mismatch(ChunkError):
+    """Raised if code, versions or instruction set of a worker differ from those of the run."""
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """A job on its way to workers, its store, and the digest that its driver expects."""
+
+    digest: str
+    place: str
+    job: Job = field(compare=False, repr=False)
+    store: BlockStore | None = field(compare=False, repr=False)
+
+
+@lru_cache(maxsize=1)
+def _unpacked(parcel: Parcel) -> Parcel:
+    # The first copy with this digest serves all blocks; it holds the compiled kernels.
+    if parcel.job.digest != parcel.digest:
+        raise Mismatch("code, versions or instruction set differ from those of the run")
+    return parcel
+
+
+def compute(parcel: Parcel, block: Block, number: int) -> Results:
+    """Compute ``block`` in a worker. The results return to the driver without a store, otherwise the outcomes alone."""
+    parcel = _unpacked(parcel)
+    results = parcel.job.compute_block(block)
+    if parcel.store is None:
+        return results
+    try:
+        parcel.store.write(number, results)
+    except OSError as error:
+        raise RetryableError(str(error)) from None
+    return {OUTCOME.name: results[OUTCOME.name]}
+
+
+class Cluster(Executor):
+    """A Dask cluster: the scheduler at ``tcp://host:port``, or ``local:N`` processes, connected until ``close``."""
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self._connection = ExitStack()
+        self._client: Any = None
+
+    def check(self) -> None:
+        """Raise :class:`InputError` if no scheduler answers at the address; a local one starts with the first work."""
+        distributed = _distributed()
+        if not _LOCAL.fullmatch(self._address):
+            with ExitStack() as stack:
+                _connect(distributed, self._address, stack)
+
+    def run(
+        self, job: Job, blocks: Iterable[Block], store: BlockStore | None, first: int, tick: Callable[[int], None]
+    ) -> Finished:
+        """Yield blocks and their outcomes, without a store their results.
+
+        A block whose worker died is computed again. Results are None after too many deaths (Dask's setting
+        ``distributed.scheduler.allowed-failures``). Exceptions are raised; a lost scheduler raises :class:`RetryableError`.
+        """
+        distributed = _distributed()
+        if self._client is None:
+            self._client = _connect(distributed, self._address, self._connection)
+        parcel = Parcel(job.digest, "" if store is None else store.place, job, store)
+        remaining, running = iter(blocks), dict[str, Block]()
+        workers = max(sum(self._client.nthreads().values()), 1)
+        finished = distributed.as_completed(loop=self._client.loop)
+        # A random part of the key: another run on the same scheduler uses the same numbers.
+        run = uuid.uuid4().hex
+        while True:
+            for block in islice(remaining, IN_FLIGHT * workers - len(running)):
+                number = first + block.number
+                future = self._client.submit(compute, parcel, block, number, key=f"block-{number}-{run}")
+                running[future.key] = block
+                finished.add(future)
+            if not running:
+                return
+            future = next(finished)
+            block, results = running.pop(future.key), _result(distributed, future)
+            future.release()
+            yield block, results
+
+    def close(self) -> None:
+        """Disconnect, and end a local cluster."""
+        self._client = None
+        self._connection.close()
+
+
+def _result(distributed: Any, future: Any) -> Results | None:
+    try:
+        return future.result()
+    except distributed.KilledWorker:
+        return None
+    except (distributed.CancelledError, OSError) as error:
+        raise RetryableError(f"dask: connection to the scheduler lost ({type(error).__name__})") from error
+
+
+def _connect(distributed: Any, address: str, stack: ExitStack) -> Any:
+    try:
+        if local := _LOCAL.fullmatch(address):
+            count = int(local.group(1))
+            cluster = distributed.LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None)
+            address = stack.enter_context(cluster).scheduler_address
+        return stack.enter_context(distributed.Client(address, timeout=_ANSWERED, set_as_default=False))
+    except RuntimeError as error:
+        where = 'below the line `if __name__ == "__main__":` of the script, which each worker imports'
+        raise InputError(f"workers: do not start ({error}); allowed is a call {where}") from None
+    except (OSError, ValueError, TypeError) as error:
+        # Dask raises TypeError if a TLS address lacks certificates.
+        raise InputError(f"dask = {address!r}: no scheduler answers there; {type(error).__name__}") from None
+
+
+def _distributed() -> Any:
+    try:
+        import distributed
+    except ImportError:
+        raise InputError(
+            "dask: the package distributed is not installed; install drivetrain_jax[distributed]"
+        ) from None
+    for name in (*_TALKATIVE, *logging.root.manager.loggerDict):
+        if name.split(".")[0] in _TALKATIVE:
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+    return distributed
+
+
+def make_executor(threads: int | None = None, workers: int | None = None, dask: str | None = None) -> Executor:
+    """The executor: Dask at ``dask`` (``tcp://host:port`` or ``local:N``), ``workers`` for ``local:N``, or ``threads``.
+
+    Raises :class:`InputError` for invalid or conflicting settings.
+    """
+    for name, value in (("threads", threads), ("workers", workers)):
+        if value is not None and not (_is_integer(value) and value >= 1):
+            raise InputError(f"{name} = {shown(value)}: allowed is {name} >= 1, an integer")
+        if value is not None and value > (most := max(_MOST, 4 * usable_cores())):
+            raise InputError(f"{name} = {value}: allowed is {name} <= {most}, because more only wait for a core")
+    if dask is not None and not re.match(r"local:[1-9]\d*$|\w+://", str(dask)):
+        raise InputError(f"dask = {dask!r}: allowed is tcp://HOST:PORT or local:N with N >= 1")
+    settings = {"threads": threads, "workers": workers, "dask": dask}
+    given = [name for name, value in settings.items() if value is not None]
+    if len(given) > 1:
+        raise InputError(f"{given[0]}: given together with {given[1]}; allowed is one of them")
+    if workers is None and dask is None:
+        return Threads(threads)
+    return Cluster(dask or f"local:{workers}")
+
+
+def _is_integer(value: object) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)

@@ -15,8 +15,7 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.store import checksums, netcdf
 from drivetrain_jax.store.files import flush, move_into_place, naming
-from drivetrain_jax.store.netcdf import BROKEN, opened, unreadable
-from drivetrain_jax.store.schema import GROUP, Labelled
+from drivetrain_jax.store.netcdf import BROKEN, GROUP, Labelled, opened, unreadable
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -19,10 +19,9 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import counted
-from drivetrain_jax.store.files import flush, sync_folder
-from drivetrain_jax.store.provenance import digest
-from drivetrain_jax.store.schema import DETAILS, GROUP, Labelled
-from drivetrain_jax.store.shards import Place, Shards
+from drivetrain_jax.store.files import digest, flush, sync_folder
+from drivetrain_jax.store.netcdf import DETAILS, GROUP, Labelled
+from drivetrain_jax.store.parts import Place, Shards
 
 # Folder among the parts in which a store grows, and the one for a store while another one replaces it.
 UNFINISHED, FORMER = "store", "former"

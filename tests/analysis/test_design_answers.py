@@ -6,7 +6,7 @@ import numpy as np
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis.critical_speeds.analysis import required_margin
-from drivetrain_jax.runs.growth_text import growth
+from drivetrain_jax.runs.reply import growth
 from tests.oracles.bicardan_reference import finite_elements
 
 

@@ -442,7 +442,7 @@ def test_a_run_that_is_refused_on_the_way_leaves_nothing(cli, monkeypatch):
     def nobody(*_):
         raise InputError("dask = 'tcp://nowhere:1': no scheduler answers there")
 
-    monkeypatch.setattr("drivetrain_jax.runs.executors.Threads.run", nobody)
+    monkeypatch.setattr("drivetrain_jax.runs.work.Threads.run", nobody)
     code, _, err = cli("run", "scene.toml", "--out", "r.nc", "--quiet")
     assert (code, len(err)) == (2, 1) and "no scheduler" in err[0] and os.listdir() == ["scene.toml"]
 

@@ -7,7 +7,7 @@ import pytest
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.cli import main
-from drivetrain_jax.runs.data_table import read_table
+from drivetrain_jax.runs.physical import read_table
 
 ROWS = (
     ("length [mm]", "outer_diameter (mm)", "inner_diameter [mm]", "material", "k_A [kN/m]", "k_D [N/m]"),

@@ -21,7 +21,7 @@ import drivetrain_jax as dt
 from drivetrain_jax.report.statements import statements
 from drivetrain_jax.report.tables import axes_table
 from drivetrain_jax.runs import job
-from drivetrain_jax.runs.point_grid import Grid
+from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.scene import Problem, result_variables
 from drivetrain_jax.store.consolidate import read_attribute
 

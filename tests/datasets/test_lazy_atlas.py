@@ -17,7 +17,7 @@ import drivetrain_jax as dt
 from drivetrain_jax.atlas import charts, evaluation, interpolation
 from drivetrain_jax.atlas.panels import position
 from drivetrain_jax.datasets import lazy
-from drivetrain_jax.runs import rounds
+from drivetrain_jax.runs import through_atlas
 from drivetrain_jax.runs.atlas_file import StoredAtlas
 from tests.atlases import atlas_file
 from tests.sizes import but_full
@@ -307,7 +307,7 @@ def test_other_readers_see_the_panels(file):
 
 @pytest.mark.full
 def test_gaps_are_solved_or_have_no_value(monkeypatch, tmp_path):
-    monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
+    monkeypatch.setattr(through_atlas, "MAX_SOLVES", 50)
     path, grid = tmp_path / "gaps.nc", {"beta": [0.1, 0.3], "Omega": [1.2, 1.3, 1.9]}
     dt.run(ATLAS, out=path)
     solved = opened(path, grid)

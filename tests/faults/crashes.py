@@ -35,8 +35,8 @@ from page import write
 
 from drivetrain_jax.cli import main
 from drivetrain_jax.runs import toml
-from drivetrain_jax.runs.status import status
-from drivetrain_jax.store.provenance import now
+from drivetrain_jax.runs.output import status
+from drivetrain_jax.store.files import now
 
 PATIENCE = 60.0
 # Allowed exit codes of a command whose system call fails.

@@ -16,7 +16,7 @@ from drivetrain_jax.atlas import design, stability
 from drivetrain_jax.atlas.boundaries import boundaries
 from drivetrain_jax.atlas.evaluation import tiles
 from drivetrain_jax.atlas.exclusion import critical_points
-from drivetrain_jax.runs import atlas_answers, rounds
+from drivetrain_jax.runs import atlas_answers, through_atlas
 from drivetrain_jax.runs.atlas_answers import _from_one
 from drivetrain_jax.runs.atlas_chart import chart
 from drivetrain_jax.runs.atlas_file import StoredAtlas
@@ -395,7 +395,7 @@ def test_without_damping_tips_are_at_the_angle_0():
 
 @pytest.mark.full
 def test_an_atlas_without_a_panel_answers_by_direct_solves(monkeypatch):
-    monkeypatch.setattr(rounds, "MAX_SOLVES", 10)
+    monkeypatch.setattr(through_atlas, "MAX_SOLVES", 10)
     source = panels((0.0, 0.5), (0.001, 0.002), rtol=1e-8)
     atlas = dt.open_atlas(source)
     assert not atlas.stability.atlas.panels

@@ -19,9 +19,11 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.atlas.criteria import Criteria, has_boundaries
 from drivetrain_jax.cli import main
-from drivetrain_jax.runs import atlas_answers, atlas_chart, atlas_choice, rounds, through_atlas
+from drivetrain_jax.runs import atlas_answers, atlas_chart, through_atlas
+from drivetrain_jax.runs import resolve as resolve_module
 from drivetrain_jax.runs.atlas_chart import chart
 from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.resolve import choose_atlas
 from drivetrain_jax.runs.run import Incomplete, Interrupted, run_to_file
 from drivetrain_jax.runs.scene import load_scene
 from tests.atlases import atlas_file
@@ -134,15 +136,15 @@ def test_points_and_multipliers_through_an_atlas():
 
 def test_auto_uses_an_atlas_for_many_points(monkeypatch, direct):
     assert "atlas_solves" not in dt.run(floquet("auto")).attrs
-    monkeypatch.setattr(atlas_choice, "_WORTHWHILE", 500)
+    monkeypatch.setattr(resolve_module, "_WORTHWHILE", 500)
     # An eighth of the effort of 533 points is that of some 30 solves, too few for an atlas of two parameters.
     assert "atlas_solves" not in dt.run(floquet("auto")).attrs
-    monkeypatch.setattr(atlas_choice, "_FEWEST", (1, 1))
+    monkeypatch.setattr(resolve_module, "_FEWEST", (1, 1))
     found = dt.run(floquet("auto"))
     # A forced attempt stops at the first round, and all points are solved directly.
     assert found.attrs["atlas_uncovered"] == 533
     assert_same_arrays(found, direct)
-    monkeypatch.setattr(atlas_choice, "_SHARE", 10.0)
+    monkeypatch.setattr(resolve_module, "_SHARE", 10.0)
     assert_agree(dt.run(floquet("auto")), direct)
 
 
@@ -150,7 +152,7 @@ def test_the_message_names_another_route_of_auto(monkeypatch, tmp_path):
     path = tmp_path / "r.nc"
     run_to_file(floquet("auto"), path)
     for name, value in (("_WORTHWHILE", 600), ("_FEWEST", (1, 1))):
-        monkeypatch.setattr(atlas_choice, name, value)
+        monkeypatch.setattr(resolve_module, name, value)
     large = floquet("auto", floquet("auto")["axes"] | {"beta": {"start": BETA[0], "stop": BETA[1], "num": 25}})
     with pytest.raises(InputError, match="route is an atlas, was direct solves") as refused:
         run_to_file(large, path)
@@ -164,11 +166,11 @@ def test_auto_counts_the_effort_of_solves_not_their_number(slowest, fastest, tri
     Below 1e-8 no solver can compute a cell.
     """
     axes = {"beta": {"start": 0.0, "stop": 1.5, "num": 400}, "Omega": {"start": slowest, "stop": fastest, "num": 400}}
-    assert (atlas_choice.choose_atlas(load_scene(floquet("auto", axes))) is not None) is tried
+    assert (choose_atlas(load_scene(floquet("auto", axes))) is not None) is tried
 
 
 def test_points_outside_an_atlas_are_solved(monkeypatch, direct):
-    monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
+    monkeypatch.setattr(through_atlas, "MAX_SOLVES", 50)
     found = dt.run(floquet("atlas"))
     assert found.attrs["atlas_uncovered"] == 533 and found.attrs["atlas_panels"] == 0
     assert_same_arrays(found, direct)
@@ -176,7 +178,7 @@ def test_points_outside_an_atlas_are_solved(monkeypatch, direct):
 
 def test_gaps_of_an_atlas_are_noted(monkeypatch, tmp_path):
     assert run_to_file(floquet("atlas"), tmp_path / "whole.nc").note == ""
-    monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
+    monkeypatch.setattr(through_atlas, "MAX_SOLVES", 50)
     told = (
         "the atlas has 0 panels and 1 gap (more than 50 solves would be needed): what lies in a gap is solved directly"
     )
@@ -292,7 +294,7 @@ def test_labelled_arrays_keep_their_labels_and_must_agree(atlas):
 @pytest.mark.full
 @pytest.mark.parametrize("outputs", [["floquet_multiplier", "verdict"], ["spectral_radius"]])
 def test_an_atlas_without_a_panel_has_all_its_points_solved(monkeypatch, tmp_path, outputs):
-    monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
+    monkeypatch.setattr(through_atlas, "MAX_SOLVES", 50)
     scene = floquet("atlas") | {"outputs": outputs}
     exact = dt.run(scene | {"options": {"method": "direct"}})
     for found in (dt.run(scene), dt.run(scene, out=tmp_path / "r.nc")):
@@ -333,7 +335,7 @@ def test_a_system_without_an_atlas_is_refused_before_anything_is_written(tmp_pat
 
 @pytest.mark.full
 def test_gaps_of_a_stored_atlas_are_solved(monkeypatch):
-    monkeypatch.setattr(rounds, "MAX_SOLVES", 50)
+    monkeypatch.setattr(through_atlas, "MAX_SOLVES", 50)
     atlas = dt.open_atlas(dt.run(ATLAS))
     assert "0 panels, 1 gap" in repr(atlas)
     found, exact = atlas(beta=0.3, Omega=1.3), dt.point("cardan", "floquet", beta=0.3, Omega=1.3, **BASE)

@@ -19,11 +19,11 @@ import xarray as xr
 import drivetrain_jax as dt
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.runs import executors, identity, toml
-from drivetrain_jax.runs.executors import Threads, make_executor, run_threads
+from drivetrain_jax.runs import identity, toml, work
 from drivetrain_jax.runs.job import Block
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.runs.work import Threads, make_executor, run_threads
 from drivetrain_jax.store.parts import BlockFiles
 
 HERE = Path(__file__).parent
@@ -168,28 +168,28 @@ def test_threads_are_reused_except_after_an_interrupt():
 def test_wrong_executor_is_one_clear_line(monkeypatch, options, message):
     if "dask" in options:
         pytest.importorskip("distributed")
-        monkeypatch.setattr(executors, "_ANSWERED", 1.0)
+        monkeypatch.setattr(work, "_ANSWERED", 1.0)
     with pytest.raises(InputError, match=message.replace("(", r"\(")):
         make_executor(**options).check()
 
 
 def test_a_worker_of_another_kind_is_refused_before_it_computes(grid_scene, monkeypatch):
     job = resolve(load_scene(grid_scene))
-    sent = pickle.dumps(executors.Parcel(job.digest, "", job, None))
+    sent = pickle.dumps(work.Parcel(job.digest, "", job, None))
     monkeypatch.setattr(identity, "versions", lambda _: {"jax": "9"})
     parcel = pickle.loads(sent)
     monkeypatch.setattr(type(job), "compute", lambda *_: pytest.fail("it computes"))
-    with pytest.raises(executors.Mismatch, match=r"^code, versions or instruction set differ from those of the run$"):
-        executors.compute(parcel, Block(0), 0)
+    with pytest.raises(work.Mismatch, match=r"^code, versions or instruction set differ from those of the run$"):
+        work.compute(parcel, Block(0), 0)
 
 
 @pytest.mark.usefixtures("small_blocks")
 def test_a_worker_stores_its_block_and_returns_outcomes(grid_scene, tmp_path):
     job = resolve(load_scene(grid_scene))
     store = BlockFiles(tmp_path)
-    parcel = pickle.loads(pickle.dumps(executors.Parcel(job.digest, store.place, job, store)))
+    parcel = pickle.loads(pickle.dumps(work.Parcel(job.digest, store.place, job, store)))
     block = Block(1, np.array([25, 27]))
-    assert list(executors.compute(parcel, block, 7)) == ["outcome"]
+    assert list(work.compute(parcel, block, 7)) == ["outcome"]
     for name, values in job.compute_block(block).items():
         assert values.tobytes() == store.read(7)[name].tobytes()
 

@@ -13,7 +13,7 @@ import drivetrain_jax as dt
 from drivetrain_jax.runs import identity
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
-from drivetrain_jax.store.provenance import source_digest
+from drivetrain_jax.store.files import source_digest
 
 CARDAN = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 BASE = {"system": "toy", "analysis": "toy", "axes": {"a": {"start": 0, "stop": 1, "num": 3}}}

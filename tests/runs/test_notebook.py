@@ -9,7 +9,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 import drivetrain_jax as dt
-from drivetrain_jax.runs import notebook
+from drivetrain_jax.runs import run
 
 
 @pytest.fixture
@@ -22,8 +22,8 @@ def shown(monkeypatch):
     display.display = lambda content, display_id: states.append(content) or SimpleNamespace(update=states.append)
     for name, module in (("IPython", ipython), ("IPython.display", display)):
         monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.setattr(notebook, "_PATIENCE", 0.0)
-    monkeypatch.setattr(notebook, "_STEP", 0.0)
+    monkeypatch.setattr(run, "_PATIENCE", 0.0)
+    monkeypatch.setattr(run, "_STEP", 0.0)
     return states
 
 
@@ -51,6 +51,6 @@ def test_a_terminal_shows_none(shown, grid_scene, monkeypatch):
 
 
 def test_a_short_run_shows_none(shown, grid_scene, monkeypatch):
-    monkeypatch.setattr(notebook, "_PATIENCE", 100.0)
+    monkeypatch.setattr(run, "_PATIENCE", 100.0)
     dt.run(grid_scene)
     assert not shown

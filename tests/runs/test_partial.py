@@ -9,8 +9,8 @@ from interrupts import stop_after
 import drivetrain_jax as dt
 from drivetrain_jax.cli import main
 from drivetrain_jax.runs.assemble import PENDING
-from drivetrain_jax.runs.executors import Threads
 from drivetrain_jax.runs.run import Interrupted, run_to_file
+from drivetrain_jax.runs.work import Threads
 from drivetrain_jax.store.parts import PartsFolder
 
 pytestmark = pytest.mark.usefixtures("small_blocks")

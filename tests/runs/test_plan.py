@@ -7,13 +7,12 @@ import pytest
 import toy
 
 from drivetrain_jax.analysis import Solver
-from drivetrain_jax.runs import plan
-from drivetrain_jax.runs.job import Block
-from drivetrain_jax.runs.plan import block_size, chunk_size, make_plan
-from drivetrain_jax.runs.point_grid import Grid
+from drivetrain_jax.runs import job
+from drivetrain_jax.runs.axes import Grid
+from drivetrain_jax.runs.job import Block, block_size, chunk_size, make_plan
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
-from drivetrain_jax.store.shards import Shards
+from drivetrain_jax.store.parts import Shards
 
 pytestmark = pytest.mark.usefixtures("small_blocks")
 
@@ -42,7 +41,7 @@ def test_every_point_is_in_exactly_one_chunk_of_the_cheapest_solver(grid_scene):
 
 def test_plan_does_not_depend_on_how_effort_is_predicted(grid_scene, monkeypatch):
     whole = engine(grid_scene).plan(Block(0))
-    monkeypatch.setattr(plan, "_PIECE", 7)
+    monkeypatch.setattr(job, "_PIECE", 7)
     for a, b in zip(whole, engine(grid_scene).plan(Block(0)), strict=True):
         assert np.array_equal(a.points, b.points) and a.effort == b.effort
 
@@ -51,8 +50,8 @@ def test_plan_does_not_depend_on_how_effort_is_predicted(grid_scene, monkeypatch
     ("seconds", "lengthy", "points"), [(1e-9, False, 1 << 18), (1e-3, False, 2000), (1.0, False, 128), (1.0, True, 16)]
 )
 def test_a_block_takes_two_seconds(monkeypatch, seconds, lengthy, points):
-    monkeypatch.setattr(plan, "_SECONDS", 2.0)
-    monkeypatch.setattr(plan, "_LEAST_CHUNKS", 8)
+    monkeypatch.setattr(job, "_SECONDS", 2.0)
+    monkeypatch.setattr(job, "_LEAST_CHUNKS", 8)
     axes = {n: {"start": 1, "stop": 2, "num": 40_000} for n in ("a", "b")}
     grid = engine({"system": "toy", "analysis": "toy", "axes": axes}).grid
     assert block_size([Solver("s", lambda *_: {}, chunk=16, seconds=seconds, lengthy=lengthy)], grid) == points

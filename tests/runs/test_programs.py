@@ -27,7 +27,7 @@ print(compiled.count("/jax/core/compile/backend_compile_duration"))
 CALLBACK = """
 import jax, jax.numpy as jnp, numpy as np
 from drivetrain_jax import _compile_cache
-from drivetrain_jax.runs import programs
+from drivetrain_jax.runs import kernel
 _compile_cache.enable(short=True)
 def called(x):
     return jax.pure_callback(lambda v: np.asarray(v) + 1, jax.ShapeDtypeStruct((3,), x.dtype), x)

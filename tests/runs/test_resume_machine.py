@@ -17,9 +17,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition,
 
 import drivetrain_jax as dt
 from drivetrain_jax import InputError
-from drivetrain_jax.runs.executors import Threads
+from drivetrain_jax.runs.output import status
 from drivetrain_jax.runs.run import Interrupted, run_to_file
-from drivetrain_jax.runs.status import status
+from drivetrain_jax.runs.work import Threads
 from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.parts import PartsFolder
 from tests.sizes import full_after

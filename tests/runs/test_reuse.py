@@ -11,10 +11,10 @@ from interrupts import stop_after
 import drivetrain_jax as dt
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.runs.executors import Threads
+from drivetrain_jax.runs.output import status
 from drivetrain_jax.runs.reuse import _positions
 from drivetrain_jax.runs.run import Interrupted, run_to_file
-from drivetrain_jax.runs.status import status
+from drivetrain_jax.runs.work import Threads
 from drivetrain_jax.store import checksums
 from tests.sizes import full_after
 

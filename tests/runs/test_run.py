@@ -23,9 +23,9 @@ import drivetrain_jax as dt
 from drivetrain_jax.analysis import Dimension, Solver
 from drivetrain_jax.functions import analyse
 from drivetrain_jax.runs import toml
-from drivetrain_jax.runs.executors import Cluster, Threads
+from drivetrain_jax.runs.output import status
 from drivetrain_jax.runs.run import Incomplete, run_to_file
-from drivetrain_jax.runs.status import status
+from drivetrain_jax.runs.work import Cluster, Threads
 from drivetrain_jax.store.parts import PartsFolder
 from tests.sizes import full_after
 
@@ -513,7 +513,7 @@ MANY = """
 import resource, sys, threading, toy
 from pathlib import Path
 toy.names()
-from drivetrain_jax.runs import assemble, plan
+from drivetrain_jax.runs import assemble, job
 from drivetrain_jax.runs.run import run_to_file
 
 # As if the sweep were as many times larger.

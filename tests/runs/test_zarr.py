@@ -18,10 +18,10 @@ from drivetrain_jax.cli import main
 from drivetrain_jax.invariants.verify import verify
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import PENDING
-from drivetrain_jax.runs.executors import Threads
+from drivetrain_jax.runs.output import status
 from drivetrain_jax.runs.run import Incomplete, Interrupted, run, run_to_file
-from drivetrain_jax.runs.status import status
 from drivetrain_jax.runs.stores import export
+from drivetrain_jax.runs.work import Threads
 from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.consolidate import read_attribute
 from drivetrain_jax.store.parts import PartsFolder

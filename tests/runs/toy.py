@@ -12,7 +12,7 @@ import numpy as np
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis import RTOL, Analysis, Outcome, Solver
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
-from drivetrain_jax.runs import plan, scene
+from drivetrain_jax.runs import job, scene
 from drivetrain_jax.systems import Model, Resonances, System, parameter
 
 _USED = ("a", "b", "n", "kind", "length", "derived")
@@ -204,8 +204,8 @@ def names(replace=setattr) -> None:
 
 def small_blocks(replace=setattr) -> None:
     """Let a block have the points of one chunk."""
-    replace(plan, "_SECONDS", 1e-4)
-    replace(plan, "_LEAST_CHUNKS", 1)
+    replace(job, "_SECONDS", 1e-4)
+    replace(job, "_LEAST_CHUNKS", 1)
 
 
 if __name__ == "__main__":

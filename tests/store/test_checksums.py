@@ -11,7 +11,7 @@ from drivetrain_jax import InputError
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.consolidate import open_result, write_result
-from drivetrain_jax.store.schema import Coordinate, Labelled
+from drivetrain_jax.store.netcdf import Coordinate, Labelled
 from tests.sizes import full_after
 
 

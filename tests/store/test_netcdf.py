@@ -10,7 +10,7 @@ import xarray as xr
 
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.store.consolidate import write_result
-from drivetrain_jax.store.schema import Coordinate, Labelled
+from drivetrain_jax.store.netcdf import Coordinate, Labelled
 
 OWN = {"_NCProperties", "checksums"}
 

@@ -15,9 +15,9 @@ import xarray as xr
 from drivetrain_jax import InputError
 from drivetrain_jax._machine import machine, physical_memory, usable_cores
 from drivetrain_jax._quantities import Dimension, Variable
-from drivetrain_jax.store import files, provenance
+from drivetrain_jax.store import files
 from drivetrain_jax.store.consolidate import ResultFile, open_result, read_attribute, release, write_result
-from drivetrain_jax.store.schema import Coordinate, Labelled
+from drivetrain_jax.store.netcdf import Coordinate, Labelled
 
 
 @pytest.fixture
@@ -150,26 +150,26 @@ def test_unreadable_result_is_one_clear_line(tmp_path, result, content):
 
 def test_digest_of_content():
     base = {"b": 1.0, "a": [1, "x", None], "v": np.array([1.0, 2.0])}
-    assert provenance.digest(base) == provenance.digest(dict(reversed(base.items())))
+    assert files.digest(base) == files.digest(dict(reversed(base.items())))
     others = [
         base | {"b": 1},
         base | {"v": np.array([1.0, 3.0])},
         base | {"v": np.array([1, 2])},
         base | {"a": ["x", 1]},
     ]
-    assert len({provenance.digest(other) for other in [base, *others]}) == 5
+    assert len({files.digest(other) for other in [base, *others]}) == 5
     with pytest.raises(TypeError, match="no digest of set"):
-        provenance.digest({1, 2})
+        files.digest({1, 2})
 
 
 def test_digest_of_sources(tmp_path):
     (tmp_path / "a.py").write_text("1")
     (tmp_path / "b.py").write_text("1")
-    one = provenance.source_digest({"x": tmp_path / "a.py"})
-    assert one == provenance.source_digest({"x": tmp_path / "b.py"})
-    assert one != provenance.source_digest({"y": tmp_path / "a.py"})
+    one = files.source_digest({"x": tmp_path / "a.py"})
+    assert one == files.source_digest({"x": tmp_path / "b.py"})
+    assert one != files.source_digest({"y": tmp_path / "a.py"})
     (tmp_path / "b.py").write_text("2")
-    assert one != provenance.source_digest({"x": tmp_path / "b.py"})
+    assert one != files.source_digest({"x": tmp_path / "b.py"})
 
 
 @pytest.mark.parametrize(
@@ -184,10 +184,10 @@ def test_digest_of_sources(tmp_path):
 )
 def test_the_command_that_runs(monkeypatch, argv, told):
     monkeypatch.setattr("sys.argv", argv)
-    assert provenance.command() == told
+    assert files.command() == told
 
 
 def test_provenance_has_machine_and_versions():
     assert "cores" in machine() and "/" not in machine().split("Python")[1]
-    assert provenance.versions(["numpy"]) == {"numpy": np.__version__}
+    assert files.versions(["numpy"]) == {"numpy": np.__version__}
     assert usable_cores() >= 1 and physical_memory() > 1e8
