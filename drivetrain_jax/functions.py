@@ -23,13 +23,13 @@ from jax import Array
 
 from drivetrain_jax import _compile_cache
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._printing import printed
 from drivetrain_jax._wording import did_you_mean
 from drivetrain_jax.analysis import OUTCOME, Analysis, Dimension, Outcome, Request, Solver, analyses_of, get_analysis
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
 from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lanes_last, path_entry
 from drivetrain_jax.analysis.request import checked_solvers, dimensions_of, make_request
 from drivetrain_jax.systems import System
+from drivetrain_jax.systems._base import printed
 
 # Lanes of similar effort that are solved together.
 _TOGETHER = 128

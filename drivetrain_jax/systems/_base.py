@@ -25,7 +25,6 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._printing import printed
 from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
 from drivetrain_jax._units import is_unit, with_unit
 from drivetrain_jax._wording import meant, nearest
@@ -480,3 +479,13 @@ def _checked(described: Parameter, value: Any) -> Any:
         return described.check(value)
     except ValueError as error:
         raise InputError(str(error)) from None
+
+
+def printed(tree: Any) -> str:
+    """The text of ``tree`` with values for arrays of one number, which Equinox prints without, and shapes for others."""
+
+    def number(leaf: Any) -> Any:
+        single = isinstance(leaf, jax.Array) and not isinstance(leaf, jax.core.Tracer) and leaf.ndim == 0
+        return leaf.item() if single else leaf
+
+    return eqx.tree_pformat(jax.tree.map(number, tree))

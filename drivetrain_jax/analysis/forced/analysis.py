@@ -38,11 +38,11 @@ from drivetrain_jax.analysis.forced.orbit import (
     in_units_of,
     integrate,
     newton_step,
+    periodic_slopes,
     shoot,
     size_of,
     transition,
 )
-from drivetrain_jax.analysis.forced.response_derivatives import periodic_slopes
 from drivetrain_jax.analysis.numerics.kernels import predicted
 from drivetrain_jax.analysis.numerics.lanes import Constants, over_lanes
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, solve, spectral_norm
