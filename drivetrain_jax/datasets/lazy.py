@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import os
-from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -119,10 +116,9 @@ def _is_count(given: Any) -> bool:
 
 # The outcome of a cell in a gap of the atlas that is not solved. No file contains this code.
 GAP = len(Outcome)
-# Bytes of the cache of results: the variables of a selection are usually requested one after another, each of them once.
-_KEPT = 24_000_000
-# Ratio of the cells of an outer product to the requested points above which the points are evaluated one by one.
-_SPARE = 4
+# Bytes of the other results of a selection that are kept, and number of selections: the variables of a selection are usually
+# requested one after another, each of them once.
+_BYTES, _SELECTIONS = 6_000_000, 4
 
 Key = tuple[int | slice | np.ndarray, ...]
 
@@ -136,18 +132,10 @@ class AtlasGrid:
     def __init__(self, path: str, axes: Mapping[str, np.ndarray], fixed: Mapping[str, float], solve: bool) -> None:
         self.path, self.axes, self.fixed, self.solve = path, dict(axes), dict(fixed), solve
         self._stamp = _stamp(path)
-        self._forget()
-
-    def _forget(self) -> None:
-        self._kept: OrderedDict[tuple, dict[str, np.ndarray]] = OrderedDict()
-        self._lock = Lock()
+        self._kept: dict[tuple, dict[str, np.ndarray]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name not in ("_kept", "_lock")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        self._forget()
+        return {**vars(self), "_kept": {}}
 
     @property
     def atlas(self) -> StoredAtlas:
@@ -186,21 +174,17 @@ class AtlasGrid:
         return {name: values[0] for name, values in found.items()}
 
     def _cached(self, parts: tuple, name: str, evaluated: Callable[[], Mapping[str, np.ndarray]]) -> np.ndarray:
-        """One result of a selection; the other results stay in the cache until they are requested or dropped."""
+        """One result of a selection; the other results of the newest selections are kept until they are requested."""
         key = tuple(part.tobytes() if isinstance(part, np.ndarray) else part for part in parts)
-        with self._lock:
-            if name in self._kept.get(key, ()):
-                return self._kept[key].pop(name)
-        found = {name: np.asarray(values) for name, values in evaluated().items()}
-        if not self.solve:
-            outcome = found[OUTCOME.name]
-            found[OUTCOME.name] = np.where(outcome == Outcome.LOST, np.int8(GAP), outcome)
-        wanted = found.pop(name)
-        with self._lock:
-            self._kept[key] = found
-            while sum(values.nbytes for kept in self._kept.values() for values in kept.values()) > _KEPT:
-                self._kept.popitem(last=False)
-        return wanted
+        if (values := self._kept.get(key, {}).pop(name, None)) is None:
+            results = {other: np.asarray(values) for other, values in evaluated().items()}
+            if not self.solve:
+                outcome = results[OUTCOME.name]
+                results[OUTCOME.name] = np.where(outcome == Outcome.LOST, np.int8(GAP), outcome)
+            values = results.pop(name)
+            if sum(others.nbytes for others in results.values()) <= _BYTES:
+                self._kept = dict([*self._kept.items(), (key, results)][-_SELECTIONS:])
+        return values
 
 
 class AtlasArray(BackendArray):
@@ -211,7 +195,7 @@ class AtlasArray(BackendArray):
         self.shape = (*(axis.size for axis in grid.axes.values()), *own)
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> np.ndarray:
-        if isinstance(key, indexing.VectorizedIndexer) and self._are_scattered(key.tuple):
+        if isinstance(key, indexing.VectorizedIndexer):
             positions = _spread_out(key.tuple, self.shape)
             swept, own = positions[: len(self.grid.axes)], positions[len(self.grid.axes) :]
             found = self.grid.points(np.broadcast_arrays(*swept), self.name)
@@ -225,12 +209,6 @@ class AtlasArray(BackendArray):
             kept = [size for size, k in zip(sizes, key, strict=True) if not isinstance(k, (int, np.integer))]
             return np.empty(kept, self.dtype)
         return self.grid.block(key[:count], self.name)[(..., *key[count:])]
-
-    def _are_scattered(self, key: Key) -> bool:
-        """True if the outer product of the positions has far more cells than the selection has points."""
-        arrays = [k for k in key if isinstance(k, np.ndarray)]
-        product = math.prod(len(np.unique(k)) for k in arrays)
-        return product > _SPARE * math.prod(np.broadcast_shapes(*(k.shape for k in arrays)))
 
 
 def _length(part: slice | np.ndarray, size: int) -> int:
