@@ -2,45 +2,66 @@
 
     python -m benchmarks.accelerator      # results/accelerator.csv; needs a jax with the accelerator's plugin
 
-The scenes are like those of benchmarks.batches, one per system, and are timed from the scene to the result in memory.
-For each of the two devices a process of its own runs every scene once, which compiles (``first_s``), and three times more;
-rates are medians of these three. Differences are relative to the largest value of a result. Lyapunov spectra have none,
-because their trajectories separate. The atlas is left out: its kernel compiles for 3 minutes on a GPU.
+The scenes, one per system, are timed from the scene to the result in memory. For each of the two devices a process of
+its own runs every scene once, which compiles (``first_s``), and three times more; rates are medians of these three.
+Differences are relative to the largest value of a result. Lyapunov spectra have none, because their trajectories
+separate. The atlas is left out: its kernel compiles for 3 minutes on a GPU.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
 
-from benchmarks.batches_scenes import FOUR, cells, gears, motion, rattle, shafts
-from benchmarks.timing import median, parser, results_folder, table, write_csv
+from benchmarks.measure import parser, results_folder, write_csv
+from tests.oracles.cardan_reference import BASE_CASE
 
 _REPEATS = 3
 _NOT_COMPARED = ("verdict", "lyapunov_spectrum")
+_GEAR = {"planet_angle": [0.0, math.pi / 2, math.pi, 3 * math.pi / 2]}
+_SHAFT = {"length": [0.07, 0.59, 0.25], "EI": [64427.0, 22157.0, 8350.0], "rhoA": [15.3, 2.81, 5.51], "k_D": 2e7}
+_RATTLE = {"B0": 0.05, "B1": 0.03, "b": math.pi / 18, "c": 0.05, "alpha": 0.25, "k": 1.0, "I": 1.0}
+_TRIPOD = {"element": "input", "beta": math.radians(9), "chi_n": 0.0026, "excitation_frequency": 3066.5}
 
 
 def scenes(quick: bool) -> dict[str, dict[str, Any]]:
     """The scenes by name."""
-    few = 100 if quick else 1
+
+    def scene(what: str, outputs: list[str], axes: Mapping[str, Any], fixed: Mapping[str, Any], **options: Any) -> Any:
+        system, analysis = what.split()
+        ranges = {name: {"start": a, "stop": b, "num": n // 10 if quick else n} for name, (a, b, n) in axes.items()}
+        return {
+            "system": system,
+            "analysis": analysis,
+            "outputs": outputs,
+            "axes": ranges,
+            "fixed": dict(fixed),
+            "options": options,
+        }
+
     return {
-        "cardan, chart direct": cells(1_000_000 // few),
-        "planetary, natural frequencies": gears(FOUR, 200_000 // few),
-        "bicardan, critical speeds": shafts(200_000 // few),
-        "rattle, steady state": rattle(("u_max", "u_min"), 8192 // few),
-        "tripod, Lyapunov spectrum": motion(
-            "lyapunov", ("lyapunov_spectrum",), 1024 // few, max_time=512 / 3066.5, steps=24
-        ),
-    }
+        "cardan, chart direct": scene("cardan floquet", ["spectral_radius", "verdict"],
+                                      {"beta": (0, 1.4, 866), "Omega": (0.1, 2, 1155)}, BASE_CASE,
+                                      method="direct", rtol=1e-9),
+        "planetary, natural frequencies": scene("planetary modes", ["natural_frequency"],
+                                                {"k_sp": (1e8, 1e9, 200_000)}, _GEAR),
+        "bicardan, critical speeds": scene("bicardan critical_speeds", ["natural_frequency"],
+                                            {"k_A": (1e6, 1e9, 200_000)}, _SHAFT),
+        "rattle, steady state": scene("rattle steady_state", ["u_max", "u_min"], {"omega": (0.3, 1.5, 8192)}, _RATTLE),
+        "tripod, Lyapunov spectrum": scene("tripod lyapunov", ["lyapunov_spectrum"], {"zeta": (0.01, 0.02, 1024)}, _TRIPOD,
+                                           max_time=512 / 3066.5, steps=24),
+    }  # fmt: skip
 
 
 def measure(folder: Path, quick: bool) -> None:
@@ -51,17 +72,17 @@ def measure(folder: Path, quick: bool) -> None:
 
     if jax.default_backend() == "cpu" and os.environ.get("JAX_PLATFORMS") != "cpu":
         sys.exit("accelerator: jax finds none")
-    told: dict[str, Any] = {"device": jax.devices()[0].device_kind}
+    measured: dict[str, Any] = {"device": jax.devices()[0].device_kind}
     for number, (name, scene) in enumerate(scenes(quick).items()):
         seconds = []
         for _ in range(_REPEATS + 1):
             start = time.perf_counter()
-            found = dt.run(scene)
+            results = dt.run(scene)
             seconds.append(time.perf_counter() - start)
-        np.savez(folder / f"{number}.npz", **{output: found[output].values for output in scene["outputs"]})
-        told[name] = {"points": found["outcome"].size, "first_s": seconds[0], "seconds": median(seconds[1:])}
-        print(f"{told['device']}: {name} {seconds[0]:.1f} s, then {told[name]['seconds']:.3g} s", flush=True)
-    (folder / "times.json").write_text(json.dumps(told))
+        np.savez(folder / f"{number}.npz", **{output: results[output].values for output in scene["outputs"]})
+        measured[name] = {"points": results["outcome"].size, "first_s": seconds[0], "seconds": median(seconds[1:])}
+        print(f"{measured['device']}: {name} {seconds[0]:.1f} s, then {measured[name]['seconds']:.3g} s", flush=True)
+    (folder / "times.json").write_text(json.dumps(measured))
 
 
 def difference(first: Path, second: Path) -> float:
@@ -71,9 +92,9 @@ def difference(first: Path, second: Path) -> float:
         return max((float(np.nanmax(np.abs(a[n] - b[n])) / np.nanmax(np.abs(a[n]))) for n in compared), default=np.nan)
 
 
-def row(number: int, name: str, told: Sequence[dict[str, Any]], folders: Sequence[Path]) -> dict[str, Any]:
+def row(number: int, name: str, measured: Sequence[dict[str, Any]], folders: Sequence[Path]) -> dict[str, Any]:
     """A line of accelerator.csv, from times and results of the accelerator and of the cores."""
-    device, cores = (one[name] for one in told)
+    device, cores = (one[name] for one in measured)
     return {
         "scene": name,
         "points": cores["points"],
@@ -93,19 +114,18 @@ def main(argv: Sequence[str] | None = None) -> None:
     if chosen.measure:
         return measure(chosen.measure, chosen.quick)
     with tempfile.TemporaryDirectory() as place:
-        folders, told = [], []
-        for name, own in (("accelerator", {}), ("cores", {"JAX_PLATFORMS": "cpu"})):
+        folders, measured = [], []
+        for name, settings in (("accelerator", {}), ("cores", {"JAX_PLATFORMS": "cpu"})):
             folders.append(Path(place, name))
             folders[-1].mkdir()
             words = [sys.executable, "-m", "benchmarks.accelerator", "--measure", str(folders[-1])]
-            done = subprocess.run(words + ["--quick"] * chosen.quick, check=False, env=dict(os.environ) | own)
+            done = subprocess.run(words + ["--quick"] * chosen.quick, check=False, env=os.environ | settings)
             if done.returncode:
                 sys.exit(done.returncode)
-            told.append(json.loads((folders[-1] / "times.json").read_text()))
-        rows = [row(i, name, told, folders) for i, name in enumerate(scenes(chosen.quick))]
-    notes = [f"{told[0]['device']}; from scene to result in memory, compiled before; first_s with compilation"]
-    write_csv(results_folder(chosen) / "accelerator.csv", rows, notes)
-    print(table(rows))
+            measured.append(json.loads((folders[-1] / "times.json").read_text()))
+        rows = [row(i, name, measured, folders) for i, name in enumerate(scenes(chosen.quick))]
+    note = f"{measured[0]['device']}; from scene to result in memory, compiled before; first_s with compilation"
+    write_csv(results_folder(chosen) / "accelerator.csv", rows, [note])
 
 
 if __name__ == "__main__":

@@ -27,8 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.results_files import load
-from benchmarks.timing import parser, results_folder, spawned_workers, table, write_csv
+from benchmarks.measure import load, parser, pool, results_folder, write_csv
 from tests.oracles import cardan_precise_reference as precise
 from tests.oracles.cardan_reference import BASE_CASE
 
@@ -277,28 +276,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     folder, size = results_folder(options), QUICK if options.quick else Size()
     size = Size(options.cells or size.cells, size.side, size.worst)
     cases = [case for case in CASES if options.only is None or case.name in options.only]
-    with spawned_workers() as pool:
-        for number, case in enumerate(cases, 1):
-            write(folder, run(case, size, pool, f"[{number}/{len(cases)}]"))
-
-
-def run(case: Case, size: Size, pool: Executor, clock: str) -> dict[str, Any]:
-    """One case, with its progress on the screen."""
-    start = time.perf_counter()
-    print(f"{clock} {case.name}", flush=True)
-    atlas = case.build()
-    print(f"{clock} {case.name}: {atlas.atlas.solves} solves, {time.perf_counter() - start:.0f} s", flush=True)
-    row = attack(case, size, atlas, pool)
-    seconds = round(time.perf_counter() - start)
-    print(table([{name: row[name] for name in row if name not in ("beta", "Omega", *_OTHERS)}]), flush=True)
-    print(f"{clock} {case.name}: {seconds} s", flush=True)
-    return row | {"seconds": seconds, "measured": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}"}
+    for case in cases:
+        start = time.perf_counter()
+        row = attack(case, size, case.build(), pool())
+        seconds = round(time.perf_counter() - start)
+        write(folder, row | {"seconds": seconds, "measured": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}"})
 
 
 def write(folder: Path, row: Mapping[str, Any]) -> None:
     """Put ``row`` into the file."""
     before = load(folder, NAME)
-    write_csv(folder / f"{NAME}.csv", merged(before.rows if before else (), row), ["gamma 100"])
+    rows = before.rows.to_dict("records") if before else []
+    write_csv(folder / f"{NAME}.csv", merged(rows, row), ["gamma 100"])
 
 
 if __name__ == "__main__":

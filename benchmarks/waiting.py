@@ -16,9 +16,10 @@ import time
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any, NamedTuple
 
-from benchmarks.timing import median, parser, results_folder, table, write_csv
+from benchmarks.measure import parser, results_folder, write_csv
 from drivetrain_jax.runs import toml
 from tests.oracles.cardan_reference import BASE_CASE
 
@@ -98,7 +99,7 @@ def measure(folder: Path, repeats: int) -> list[dict[str, Any]]:
         turns.append({name: spent(lines, folder / name) for name, lines in commands(folder, turn).items()})
     rows = []
     for name, (aim, first_aim) in AIMS.items():
-        first, *later = (each[name] for each in turns)
+        first, *later = (turn[name] for turn in turns)
         rows.append(
             {
                 "command": name,
@@ -112,12 +113,11 @@ def measure(folder: Path, repeats: int) -> list[dict[str, Any]]:
     return rows
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Measure all commands and write the file."""
-    options = parser(__doc__).parse_args()
+    options = parser(__doc__).parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
         rows = measure(Path(folder), 1 if options.quick else 5)
-    print(table(rows))
     note = "CPU seconds of a process, its start included; first: without compiled code; later: medians of processes with it"
     write_csv(results_folder(options) / "waiting.csv", rows, [note])
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.readme import written
-from benchmarks.results_files import not_measured
+from benchmarks.measure import RESULTS
+from benchmarks.page import between_marks, not_measured, readme_part
 
 pytestmark = pytest.mark.docs
 
@@ -33,8 +33,8 @@ def test_python_blocks_print_what_the_readme_shows(tmp_path):
 
 def test_the_measured_part_is_what_the_stored_files_give(tmp_path):
     text = (ROOT / "README.md").read_text()
-    assert written(text) == text, "run `python -m benchmarks.page`"
-    assert not_measured("throughput") in written(text, tmp_path)
+    assert between_marks(text, readme_part(RESULTS)) == text, "run `python -m benchmarks.page`"
+    assert readme_part(tmp_path) == not_measured("precision_chart")
 
 
 def test_no_figure_of_a_measurement_is_typed():

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.timing import provenance
+from benchmarks.measure import provenance
 
 FOLDER = Path(__file__).parents[2] / "docs" / "validation"
 Rows = Sequence[Sequence[str]]

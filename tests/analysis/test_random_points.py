@@ -10,8 +10,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from benchmarks.engine_job import columns_scene, engine_job
-from benchmarks.random_points import decades
+from benchmarks.measure import columns_scene, engine_job
 from drivetrain_jax.analysis import Outcome
 from tests.analysis.test_floquet import assert_bound_holds
 from tests.oracles import ball_arithmetic
@@ -26,6 +25,11 @@ POINTS = 50_000
 _PART = 4096
 Columns = dict[str, np.ndarray]
 Below = Callable[[Ball, Columns], Count]
+
+
+def decades(rng: np.random.Generator, count: int, low: float, high: float) -> np.ndarray:
+    """Random numbers, uniform in their logarithm."""
+    return np.exp(rng.uniform(math.log(low), math.log(high), count))
 
 
 def random_gears(count: int, planets: int) -> Columns:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from benchmarks import atlas_attack
-from benchmarks.page_atlas import PAGE, label, section, written
+from benchmarks.measure import RESULTS
+from benchmarks.page import ATLAS_PAGE, atlas_part, between_marks, chart_label
 
 pytestmark = pytest.mark.docs
 
@@ -19,20 +20,22 @@ ROW = {
 
 
 def test_the_measured_part_is_what_the_stored_file_gives(tmp_path):
-    text = PAGE.read_text()
-    assert written(text) == text, "run `python -m benchmarks.page`"
-    assert "Not measured: `atlas_attack.csv` is missing." in written(text, tmp_path)
+    text = ATLAS_PAGE.read_text()
+    assert between_marks(text, atlas_part(RESULTS)) == text, "run `python -m benchmarks.page`"
+    assert atlas_part(tmp_path) == "Not measured: `atlas_attack.csv` is missing."
 
 
 def test_a_case_alone_keeps_the_rows_of_the_others(tmp_path):
     for row in (ROW | {"solves": 1}, ROW | {"case": "base"}, ROW):
         atlas_attack.write(tmp_path, row)
-    lines = section(tmp_path).splitlines()
+    lines = atlas_part(tmp_path).splitlines()
     base, *_, four = [line for line in lines if "160,416" in line]
     assert lines.index(base) < lines.index(four) and len([line for line in lines if "not measured" in line]) == 14
     assert "$2\\cdot10^{-9}$ | 16 x 39 x 32 x 8, 4 x 5 x 6 x 7 | 160,416 | 6.1 MB | 4.0e-11 |" in four
-    assert "| 5.7e-10 | 0.0013 | 0.3 | 0.5 | 12 of 1,000,000 | 3 | 4 |" in section(tmp_path)
+    assert "| 5.7e-10 | 0.0013 | 0.3 | 0.5 | 12 of 1,000,000 | 3 | 4 |" in atlas_part(tmp_path)
 
 
 def test_labels_tell_the_cases_apart():
-    assert len({label(case) for case in atlas_attack.CASES}) == len({case.name for case in atlas_attack.CASES}) == 9
+    assert (
+        len({chart_label(case) for case in atlas_attack.CASES}) == len({case.name for case in atlas_attack.CASES}) == 9
+    )

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import precision_attractors, precision_forced, precision_planetary
+from benchmarks import cardan, planetary, rattle
 from tests.oracles.bicardan_precise_reference import determinant
 from tests.oracles.bicardan_reference import transfer_determinant
 from tests.oracles.cardan_orbit_reference import nonlinear_orbit
 from tests.oracles.cardan_reference import BASE_CASE, monodromy, spectral_radius, stacked_half_period_monodromy
-from tests.oracles.chaos_reference import _orthonormalise
 from tests.oracles.planetary_reference import extension_matrix
 from tests.oracles.rattle_reference import scipy_events
 
@@ -28,28 +27,19 @@ def test_half_a_period_gives_the_radius_of_a_whole_one():
 @pytest.mark.full
 def test_rivals_of_the_forced_motion_and_of_attractors_find_it():
     """The references of the new studies, against each other."""
-    region = precision_forced.REGIONS["orbit"]
-    found = precision_forced.scipy_shooting(region, 1e-9)
+    region = cardan.MOTIONS["orbit"]
+    found = cardan.scipy_shooting(region, 1e-9)
     np.testing.assert_allclose(found, nonlinear_orbit(region.point)[0], rtol=0, atol=1e-9 * np.abs(found).max())
-    values = precision_attractors.REGIONS["attractor, both flanks"]
-    periods = precision_attractors.periods_to(values, 1e-6)
+    values = rattle.LIMITS["attractor, both flanks"]
+    periods = rattle.periods_to(values, 1e-6)
     states = np.array([scipy_events(values, 0.0, 0.0, periods, 1e-7)])
-    assert precision_attractors.error_of("attractor, both flanks", states).error < 1e-5
+    assert rattle.limit_error("attractor, both flanks", None, states).error < 1e-5
 
 
 def test_exact_shapes_are_those_of_lapack():
-    gear = precision_planetary.TABLE_2 | {"planet_angle": (0.0, 1.9, 4.4)}
+    gear = planetary.TABLE_2 | {"planet_angle": (0.0, 1.9, 4.4)}
     squares = extension_matrix(gear).T @ extension_matrix(gear)
-    assert precision_planetary.shape_error(gear, np.linalg.eigh(squares)[1].T).error < 1e-11
-
-
-def test_rivals_vectors_are_orthonormal_as_lapack_makes_them():
-    vectors = np.random.default_rng(0).normal(size=(2, 3, 3, 5))
-    lapack = np.abs(np.diagonal(np.linalg.qr(vectors.transpose(0, 3, 2, 1))[1], axis1=-2, axis2=-1))
-    lengths = _orthonormalise(vectors)
-    assert np.abs(np.moveaxis(lengths, 0, -1) / lapack - 1).max() < 1e-13
-    products = np.einsum("mica,mjca->maij", vectors, vectors)
-    assert np.abs(products - np.eye(3)).max() < 1e-13
+    assert planetary.shape_error(gear, np.linalg.eigh(squares)[1].T).error < 1e-11
 
 
 def test_the_plain_determinant_is_that_of_many_digits():
