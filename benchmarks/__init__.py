@@ -1,1 +1,1 @@
-"""Measurements behind the choices and claims of drivetrain_jax, each a command ``python -m benchmarks.NAME``."""
+"""Measurements behind the choices and claims of drivetrain_jax: ``python -m benchmarks`` runs all of them."""

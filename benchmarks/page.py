@@ -295,7 +295,7 @@ def _highlights(rows: pd.DataFrame, pairs: Sequence[Compared]) -> list[str]:
     lines = []
     for pair in (pair for pair in pairs if (pair.system, pair.region) == ("bicardan", "typical")):
         rate = count(1 / pair.package.seconds_per_point)
-        speed = against(pair.ratio, pair.rival.method)
+        speed = against(pair.ratio, f"the best rival ({pair.rival.method})")
         lines.append(f"Stepped shaft: {rate} shafts/s on one core with six certified critical speeds each, {speed}.")
     rates = 1 / rows[rows.system == "atlas"].groupby("method").seconds_per_point.min()
     words = {"package, evaluation": "grid cells", "package, points": "scattered points"}
