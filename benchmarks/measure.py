@@ -137,13 +137,16 @@ class Study:
         ]  # fmt: skip
 
     def run(self, quick: bool, folder: Path) -> None:
-        """Measure and write ``precision_<system>.csv``."""
+        """Measure and write ``precision_<system>.csv``, unless there is nothing to measure."""
+        if not (contenders := self.contenders(quick)):
+            print(f"{self.system}: left out, it is not in a quick run or needs heyoka")
+            return
         repeats, spent = (3, SPENT / 4) if quick else (REPEATS, SPENT)
         about = f"medians of up to {repeats} runs in turns, as many as {spent:g} s allow ('timed'), without compilation"
         notes = [about, *self.notes(self.quick if quick else self.regions)]
         write_csv(
             folder / f"precision_{self.system}.csv",
-            list(map(asdict, measure(self.contenders(quick), repeats, spent))),
+            list(map(asdict, measure(contenders, repeats, spent))),
             notes,
         )
 

@@ -187,6 +187,8 @@ def test_a_table_gives_a_contender_for_every_region_method_and_setting(tmp_path)
     assert len(names) == 5 and names[-1] == ("long", "b", "2 steps", 4)
     study.run(True, tmp_path)
     assert [*page.rungs(tmp_path).error] == [1e-3, 2.0]
+    replace(study, system="chart", quick=()).run(True, tmp_path)
+    assert not (tmp_path / "precision_chart.csv").exists()
 
 
 def test_two_threads_that_ask_for_the_same_make_it_once():
