@@ -109,8 +109,8 @@ _COMMANDS: dict[str, tuple[str, tuple[Argument, ...]]] = {
     "export": ("write a Zarr store as one HDF5 file, or a result as CSV", (
         _file("store", "RESULT", "a Zarr store, or with --csv any result on a grid"),
         _file("file", "FILE.nc", "HDF5 file to write", nargs="?"),
-        _value("--csv", "TABLE.csv", "write a table (RESULT.csv): a row a point, units in its header, codes as words",
-               nargs="?", const=""),
+        _value("--csv", "TABLE.csv", nargs="?", const="",
+               text="write a table (default: RESULT.csv): one row a point, units in the header, codes as words"),
     )),
     "plot": ("draw the figure of a result", (
         _file("files", "FILE.nc", "results; overlaid: methods of one analysis, or a chart and its atlas", nargs="+"),
