@@ -273,10 +273,15 @@ def take(columns: Columns, index: Any) -> dict[str, np.ndarray]:
 def near(
     values: Mapping[str, float], names: Sequence[str], count: int, width: float, seed: int = 0
 ) -> dict[str, np.ndarray]:
-    """Columns of ``count`` points: ``values`` first, then points whose ``names`` differ by up to the part ``width``."""
-    rng = np.random.default_rng(seed)
-    factors = {name: np.r_[1.0, rng.uniform(1 - width, 1 + width, count - 1)] for name in names}
-    return {name: value * factors.get(name, np.ones(count)) for name, value in values.items()}
+    """Columns of ``count`` points: ``values`` first, then points whose ``names`` differ by up to the part ``width``.
+
+    Fewer points are the first ones of more.
+    """
+    columns = {name: np.full(count, value) for name, value in values.items()}
+    for number, name in enumerate(names):
+        rng = np.random.default_rng((seed, number))
+        columns[name] = columns[name] * np.r_[1.0, rng.uniform(1 - width, 1 + width, count - 1)]
+    return columns
 
 
 def columns_scene(system: str, analysis: str, outputs: Sequence[str], columns: Columns, **rest: Any) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from benchmarks.measure import (
     is_silent,
     load,
     measure,
+    near,
     once,
     provenance,
     write_csv,
@@ -189,6 +190,14 @@ def test_a_table_gives_a_contender_for_every_region_method_and_setting(tmp_path)
     assert [*page.rungs(tmp_path).error] == [1e-3, 2.0]
     replace(study, system="chart", quick=()).run(True, tmp_path)
     assert not (tmp_path / "precision_chart.csv").exists()
+
+
+def test_fewer_neighbours_are_the_first_of_more():
+    """A method that computes few points is compared with the same reference."""
+    many, few = (near({"a": 2.0, "b": 3.0, "c": 1.0}, ("a", "b"), count, 0.01) for count in (8, 2))
+    assert all(few[name].tolist() == many[name][:2].tolist() for name in "abc")
+    assert many["a"][0] == 2.0 and many["c"].tolist() == [1.0] * 8
+    assert np.ptp(many["a"]) > 0 and np.abs(many["b"] / 3 - 1).max() <= 0.01
 
 
 def test_two_threads_that_ask_for_the_same_make_it_once():
