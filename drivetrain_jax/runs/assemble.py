@@ -124,6 +124,17 @@ def missing_value(variable: Variable) -> float | int:
     return Outcome.STEP_LIMIT if variable.name == OUTCOME.name else variable.missing
 
 
+def misfits(layout: Mapping[str, tuple[Any, tuple[int, ...]]], scene: Scene) -> list[str]:
+    """Names of the results whose type or shape in a file (``layout``) is not that of ``scene``; none for an atlas."""
+    shape = Grid.of(scene).result_shape
+
+    def fits(variable: Variable) -> bool:
+        kind, found = layout.get(variable.name, ("", ()))
+        return kind == variable.dtype and found[: len(shape)] == shape and len(found) == len(shape) + len(variable.dims)
+
+    return [v.name for v in (() if scene.analysis.continuous else result_variables(scene)) if not fits(v)]
+
+
 def dimension_sizes(scene: Problem, grid: Grid) -> dict[str, int]:
     """Lengths of the dimensions of the results besides those of the sweep, those that depend on the system included."""
     sizes, variables = {d.name: len(d.values) for d in scene.dimensions}, result_variables(scene)

@@ -17,16 +17,15 @@ import numpy as np
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.runs.assemble import PENDING, ResultBuffer, labelled, with_pending
+from drivetrain_jax.runs.assemble import PENDING, ResultBuffer, labelled, misfits, with_pending
 from drivetrain_jax.runs.identity import differences
 from drivetrain_jax.runs.job import Job, Results
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.reuse import NO_REUSE, Damaged, NotReusable, ReusableResult, ReusedPoints, combined, find
 from drivetrain_jax.runs.scene import load_scene, restore_scene
-from drivetrain_jax.runs.stores import BlockStore, ZarrBlocks
+from drivetrain_jax.runs.stores import BlockStore, ZarrBlocks, stored_blocks
 from drivetrain_jax.store import checksums, consolidate, zarr_store
-from drivetrain_jax.store.consolidate import read_attribute, read_variable
-from drivetrain_jax.store.files import behind_link, move_folder
+from drivetrain_jax.store.files import behind_link
 from drivetrain_jax.store.netcdf import opened
 from drivetrain_jax.store.parts import PartsFolder
 
@@ -34,6 +33,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 HDF5, ZARR = "hdf5", "zarr"
+# Results that the remark about missed tolerances names, and the code of the verdict that is none.
+_BOUND, _VERDICT, _UNDECIDED = "spectral_radius_error", "verdict", 2
 # Endings of files of other kinds.
 _FOREIGN = {".csv", ".html", ".json", ".mat", ".npy", ".npz", ".pdf", ".png", ".svg", ".toml", ".txt", ".xlsx", ".zip"}
 
@@ -50,18 +51,18 @@ class Output:
         self.out, self.job = behind_link(out.expanduser()), job
         self.parts = PartsFolder(self.out)
         self._check_folders()
-        former = self.parts.path / zarr_store.FORMER
-        # A run moves the present store aside just before it moves the new one into place.
-        self.held = former if not self.out.exists() and former.exists() else self.out
-        is_store = zarr_store.is_store(self.held) or zarr_store.was_store(self.held)
-        self.store = store or (ZARR if is_store else self.parts.plan().get("store", HDF5))
-        if self.held.is_dir() and not (is_store and self.store == ZARR):
+        # The plan of unfinished work; empty without any.
+        self.unfinished = self.parts.plan()
+        is_store = zarr_store.is_store(self.out)
+        self.store = store or (ZARR if is_store else self.unfinished.get("store", HDF5))
+        if self.out.is_dir() and not (is_store and self.store == ZARR):
             raise self._error("is a folder; allowed is the path of a file")
-        if self.held.exists() and not self.held.is_dir() and not (self.held.is_file() and self.store == HDF5):
+        if self.out.exists() and not self.out.is_dir() and not (self.out.is_file() and self.store == HDF5):
             what = "is a file; allowed for store = 'zarr' is a new path, or such a store"
             raise self._error(what if self.store == ZARR else "not a regular file; allowed is the path of a file")
-        self.present = self._digest()
-        self._plan_seen = self.parts.plan()
+        # Attributes and digest of the present result: None without one, empty if the metadata of a store are damaged.
+        self.attrs = self._attributes()
+        self.present = None if self.attrs is None else self.attrs.get("digest", "")
 
     def _error(self, text: str) -> InputError:
         return InputError(f"out = {str(self.out)!r}: {text}")
@@ -73,12 +74,10 @@ class Output:
         try:
             if not folder.is_dir():
                 raise self._error(f"the folder {str(folder)!r} does not exist; allowed is a file in an existing folder")
-            if parts.exists() and not parts.is_dir():
-                raise self._error(f"{str(parts)!r} is a file; allowed is to move it away")
+            if parts.exists() and not (parts.is_dir() and os.access(parts, os.R_OK | os.X_OK)):
+                raise self._error(f"{str(parts)!r} is no readable folder; allowed is to move it away")
         except OSError as error:
             raise self._error(f"{error.strerror} (with '.parts'); allowed is a shorter name") from None
-        if parts.exists() and not os.access(parts, os.R_OK | os.X_OK):
-            raise self._error(f"the folder {str(parts)!r} is not readable; allowed is one that is")
 
     def check_writable(self) -> None:
         """Raise :class:`InputError` if the folder of the result is not writable."""
@@ -86,105 +85,79 @@ class Output:
             if folder.exists() and not os.access(folder, os.W_OK | os.X_OK):
                 raise self._error(f"the folder {str(folder)!r} is not writable; allowed is a file in a writable folder")
 
-    def _digest(self) -> str | None:
-        """Digest of the present result; None without one, empty if the metadata of a store are damaged."""
-        if not self.held.exists():
+    def _attributes(self) -> Mapping[str, Any] | None:
+        """Attributes of the present result; None without one."""
+        if not self.out.exists():
             return None
+        allowed = "allowed is a new file or a result of drivetrain_jax"
         try:
-            found = self.attribute("digest")
+            found = (zarr_store.attributes if self.store == ZARR else consolidate.read_attributes)(self.out)
         except InputError:
             if self.store == HDF5:
-                what = "not a readable netCDF4/HDF5 file; allowed is a new file or a result of drivetrain_jax"
-                raise self._error(what) from None
-            found = ""
-        if not isinstance(found, str):
-            raise self._error("not a result of drivetrain_jax; allowed is a new file or a result of drivetrain_jax")
+                raise self._error(f"not a readable netCDF4/HDF5 file; {allowed}") from None
+            return {}
+        if not isinstance(found.get("digest"), str):
+            raise self._error(f"not a result of drivetrain_jax; {allowed}")
         return found
-
-    def attribute(self, name: str) -> Any:
-        """A global attribute of the present result."""
-        if self.store == ZARR:
-            return zarr_store.attributes(self.held).get(name)
-        return read_attribute(self.held, name)
-
-    @property
-    def _written(self) -> int | None:
-        """Time at which the present result was written, by the clock of its file system."""
-        file = self.held / "zarr.json" if self.held.is_dir() else self.held
-        return file.stat().st_mtime_ns if file.exists() else None
 
     def discard(self) -> None:
         """Delete the remains of the run that made the present result, if it was killed before it could delete them.
 
         Work of another scene, and work that will replace the present result, stay.
         """
-        plan = self.parts.plan()
-        replaces = (plan.get("replaces"), plan.get("replaces_written")) == (self.present, self._written)
-        if self.parts.path.exists() and plan.get("digest") in (None, self.present) and not replaces:
+        done = self.unfinished.get("digest") in (None, self.present)
+        if self.parts.path.exists() and done and self.unfinished.get("replaces") != self.present:
             # Readers can use the result even if the remains cannot be deleted.
             with suppress(InputError, OSError):
                 self.parts.open()
                 self.parts.close(remove=True)
-
-    def restore(self) -> None:
-        """Restore a store whose replacement was killed. Raises :class:`InputError` if that run is still working."""
-        if self.held == self.out:
-            return
-        self.check_writable()
-        self.parts.open()
-        try:
-            if not self.out.exists() and self.held.exists():
-                move_folder(self.held, self.out)
-            self.held = self.out
-        finally:
-            self.parts.close()
 
     @cached_property
     def state(self) -> str:
         """``absent``, ``partial``, ``complete`` or ``stale``."""
         if self.present == self.job.digest:
             return "stale" if self._damage else "complete"
-        if self.parts.holds_work():
-            # Parts that replace a result are only valid for the replacement of that result.
-            return "partial" if self._agrees(self.plan(), "digest", "replaces", "store") else "stale"
+        if self.unfinished:
+            return "partial" if self._continues else "stale"
         if self.present is None:
             return "absent"
         return "partial" if self._grows else "stale"
+
+    @property
+    def _continues(self) -> bool:
+        """True if the unfinished work is that of this scene, to replace what is present.
+
+        A store is moved away before another one replaces it.
+        """
+        same = self.unfinished.get("digest") == self.job.digest and self.unfinished.get("store") == self.store
+        return same and self.present in (None, self.unfinished.get("replaces"))
 
     def plan(self, reused: ReusedPoints = NO_REUSE, fresh: bool = False) -> dict[str, Any]:
         """The digest of new parts, and the entries that a reader needs to interpret them."""
         return {
             "digest": self.job.digest,
             "replaces": self.present,
-            "replaces_written": self._written,
             "store": self.store,
             "fresh": fresh,
             "reuses": reused.digest,
-            "reused": reused.count,
             "reused_files": [os.path.relpath(source.path, self.out.parent) for source in reused.sources],
-            **self._provenance,
+            # What explains later how stored work differs from a scene.
+            "scene": self.job.scene.text,
+            "drivetrain_jax_version": drivetrain_jax.__version__,
+            **self.job.numerics_attrs,
         }
-
-    @property
-    def _provenance(self) -> dict[str, str]:
-        """Attributes that explain later how stored work differs from a scene."""
-        version = {"drivetrain_jax_version": drivetrain_jax.__version__}
-        return {"scene": self.job.scene.text, **version, **self.job.numerics_attrs}
-
-    def _agrees(self, plan: dict[str, Any], *names: str) -> bool:
-        return all(self.parts.plan().get(name) == plan[name] for name in names)
 
     def resumes(self, reused: ReusedPoints, fresh: bool) -> bool:
         """True if a run resumes the present parts. A ``fresh`` run resumes only parts of a fresh run."""
         if not fresh:
-            return self.parts.holds_work()
-        return self._agrees(
-            self.plan(reused, fresh), "digest", "replaces", "replaces_written", "store", "reuses", "fresh"
-        )
+            return bool(self.unfinished)
+        same = (self.unfinished.get("fresh"), self.unfinished.get("reuses")) == (True, reused.digest)
+        return self._continues and same
 
     def check_unchanged(self) -> None:
         """Raise :class:`InputError` if another run has finished or started since this object was created."""
-        if (self._digest(), self.parts.plan()) != (self.present, self._plan_seen):
+        now = self._attributes()
+        if (None if now is None else now.get("digest", ""), self.parts.plan()) != (self.present, self.unfinished):
             raise self._error("another run has changed it; run the command again")
 
     @cached_property
@@ -193,8 +166,10 @@ class Output:
         if self.present not in (self.job.digest, ""):
             return ""
         if self.store == ZARR:
-            return zarr_store.damage(self.held)
-        changed = checksums.damaged(self.held)
+            return zarr_store.damage(self.out) or ", ".join(misfits(zarr_store.layout(self.out), self.job.scene))
+        changed = checksums.damaged(self.out)
+        if changed == []:
+            changed = misfits(consolidate.layout(self.out), self.job.scene)
         return "its checksums are gone" if changed is None else checksums.named(changed)
 
     @cached_property
@@ -203,18 +178,14 @@ class Output:
         if self.present is None or self.store == ZARR or self.job.scene.analysis.continuous:
             return None
         try:
-            return find(self.job, self.held)
+            return find(self.job, self.out)
         except NotReusable as error:
             return error
 
     @property
-    def _shared(self) -> ReusableResult | None:
-        return self._found if isinstance(self._found, ReusableResult) else None
-
-    @property
     def _grows(self) -> bool:
         """True if this scene contains all points of the present result, so replacing it loses nothing."""
-        return self._shared is not None and self._shared.is_covered
+        return isinstance(self._found, ReusableResult) and self._found.is_covered
 
     def reused_points(self, reuse: Sequence[str | Path], fresh: bool) -> ReusedPoints:
         """The points that a run reuses from the results ``reuse`` and, unless it is ``fresh``, from the present result.
@@ -230,13 +201,13 @@ class Output:
         paths = [Path(path) for path in reuse]
         found = [find(self.job, path) for path in paths]
         # Unfinished fresh work is resumed as fresh.
-        if not (fresh or self.parts.plan().get("fresh")):
+        if not (fresh or self.unfinished.get("fresh")):
             if isinstance(self._found, Damaged):
                 raise self.refusal
-            found += [self._shared] if self._shared is not None and self._grows else []
+            found += [self._found] if isinstance(self._found, ReusableResult) and self._found.is_covered else []
         reused = combined(self.job, found)
-        if not fresh and self.parts.holds_work() and self.parts.plan().get("reuses") != reused.digest:
-            files = ", ".join(self.parts.plan().get("reused_files") or ["no other result"])
+        if not fresh and self.unfinished and self.unfinished.get("reuses") != reused.digest:
+            files = ", ".join(self.unfinished.get("reused_files") or ["no other result"])
             raise InputError(
                 f"reuse = {[str(p) for p in paths]}: the unfinished work at {str(self.out)!r} takes points from {files}; "
                 "allowed is the same again, or --fresh"
@@ -250,65 +221,55 @@ class Output:
 
     def finished(self) -> Iterator[tuple[np.ndarray, Results]]:
         """Yield points and results of unfinished work, reused ones included."""
-        if self.parts.holds_work():
-            names = self.parts.plan().get("reused_files") or ()
+        if self.unfinished:
+            names = self.unfinished.get("reused_files") or ()
             reused = combined(self.job, [find(self.job, self.out.parent / name) for name in names])
         else:
             reused = self.reused_points((), fresh=False)
         yield from reused.blocks()
-        stored = set(self.blocks.numbers())
-        for block in self.job.blocks(reused.others(self.job.grid.size)):
-            if block.number in stored and (results := self.blocks.read(block.number)) is not None:
-                yield self.job.points(block), results
+        for block, results in stored_blocks(self.blocks, self.job, reused.others(self.job.grid.size)):
+            yield self.job.points(block), results
 
     @property
     def refusal(self) -> InputError:
         """The message of a run that may not replace the present result."""
-        return self._error(f"holds {self.obstacle}; {self.remedy}")
+        return self._error(self.reason)
 
     @property
-    def remedy(self) -> str:
-        """The remedy for the :attr:`obstacle`."""
-        replaces = "--fresh replaces it (fresh=True in Python)"
-        if self._shared is None or self.parts.holds_work():
-            return replaces
-        kept = f"--reuse {self.out.name} with another --out takes {ReusedPoints((self._shared,)).count} points from it"
-        return f"{replaces}, {kept}"
+    def reason(self) -> str:
+        """The reason why a run stops, and the remedy."""
+        remedy = "--fresh replaces it (fresh=True in Python)"
+        if isinstance(self._found, ReusableResult) and not self.unfinished:
+            kept = (
+                f"--reuse {self.out.name} with another --out takes {ReusedPoints((self._found,)).count} points from it"
+            )
+            remedy = f"{remedy}, {kept}"
+        return f"holds {self.obstacle}; {remedy}"
 
     @property
     def obstacle(self) -> str:
-        """The reason why a run stops or would stop; empty without one."""
+        """What a run would replace."""
         what = self._damage or (self._found.what if isinstance(self._found, Damaged) else "")
         if what:
             return f"a damaged result ({what})"
-        if self.parts.holds_work():
-            stored, what = self.parts.plan(), "unfinished work"
-            if self.present != stored.get("replaces"):
-                return f"{what} that was started for another result"
-            if self.store != stored.get("store"):
-                return f"{what} of --store {stored.get('store')}"
-        else:
-            stored, what = {name: self.attribute(name) for name in self._provenance}, "a result"
+        stored, what = self.unfinished or self.attrs or {}, "unfinished work" if self.unfinished else "a result"
+        if self.unfinished and self.present not in (None, stored.get("replaces")):
+            return f"{what} that was started for another result"
+        if self.unfinished and self.store != stored.get("store"):
+            return f"{what} of --store {stored.get('store')}"
         reasons = differences(stored, self.job)
         more = f" and {len(reasons) - 2} more" if len(reasons) > 2 else ""
         return f"{what} of another scene or version: {'; '.join(reasons[:2]) or 'other sizes of chunks'}{more}"
 
-    @property
-    def outcomes(self) -> np.ndarray:
-        """Outcomes of the points of the complete result. An atlas has no points."""
-        if self._solves is not None:
-            return np.empty(0, OUTCOME.dtype)
-        read = zarr_store.read_variable if self.store == ZARR else read_variable
-        return read(self.held, OUTCOME.name)
-
-    def points(self, total: int) -> int:
-        """Number of points of the complete result, or of solves of an atlas."""
-        return total if self._solves is None else self._solves
-
-    @property
-    def _solves(self) -> int | None:
-        value = self.attribute("solves")
-        return None if value is None else int(np.squeeze(value))
+    def counted(self) -> tuple[int, np.ndarray]:
+        """Number of points of the complete result, and their outcomes; of an atlas its solves, which have no outcomes."""
+        if self.job.scene.analysis.continuous:
+            try:
+                return int((self.attrs or {})["solves"]), np.empty(0, OUTCOME.dtype)
+            except (KeyError, TypeError, ValueError):
+                raise self._error("no atlas has these attributes; --fresh replaces it") from None
+        read = zarr_store.read_variable if self.store == ZARR else consolidate.read_variable
+        return self.job.total, read(self.out, OUTCOME.name)
 
 
 @dataclass(frozen=True)
@@ -350,43 +311,27 @@ def status(
     job = resolve(load_scene(scene, overrides))
     output, total = Output(Path(out), job), 0 if job.scene.analysis.continuous else job.total
     if output.state == "stale":
-        reason = f"it holds {output.obstacle}; {output.remedy}"
-        return Status(total, 0, 0, output.state, reason=reason)
+        return Status(total, 0, 0, "stale", reason=f"it {output.reason}")
+    done, found = None, []
     try:
-        codes = _codes(output)
+        if output.state == "complete":
+            done, outcomes = output.counted()
+            found = [outcomes]
+        elif output.state == "partial" and job.scene.analysis.continuous:
+            stored = map(output.blocks.read, output.blocks.numbers())
+            found = [results[OUTCOME.name] for results in stored if results is not None]
+        elif output.state == "partial" and job.route.is_pointwise:
+            # A run through an atlas has no points before its end.
+            found = [results[OUTCOME.name] for _, results in output.finished()]
     except InputError as error:
         return Status(total, 0, 0, "stale", reason=str(error))
-    done = output.points(codes.total()) if output.state == "complete" else codes.total()
+    numbers, counts = np.unique(np.concatenate([np.empty(0, np.int8), *map(np.ravel, found)]), return_counts=True)
+    codes = Counter(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
+    done = codes.total() if done is None else done
     without = {o.name.lower(): codes[o] for o in Outcome if not o.has_value and codes[o]}
-    return Status(
-        total or done,
-        done,
-        sum(without.values()),
-        output.state,
-        without,
-        remedy=job.scene.analysis.remedy(job.scene.request),
-        inaccurate=codes[Outcome.TOLERANCE_NOT_MET],
-    )
-
-
-def _codes(output: Output) -> Counter[int]:
-    """Number of finished points by outcome; of an atlas, number of finished solves."""
-    job, codes = output.job, Counter[int]()
-    if output.state == "complete":
-        found = [output.outcomes]
-    elif output.state != "partial":
-        found = []
-    elif job.scene.analysis.continuous:
-        stored = (output.blocks.read(number) for number in output.blocks.numbers())
-        found = (results[OUTCOME.name] for results in stored if results is not None)
-    elif job.route.is_pointwise:
-        found = (results[OUTCOME.name] for _, results in output.finished())
-    else:
-        # A run through an atlas has no points before its end.
-        found = []
-    for outcome in found:
-        codes.update(dict(zip(*(part.tolist() for part in np.unique(outcome, return_counts=True)), strict=True)))
-    return codes
+    failed, inaccurate = sum(without.values()), codes[Outcome.TOLERANCE_NOT_MET]
+    remedy = job.scene.analysis.remedy(job.scene.request)
+    return Status(total or done, done, failed, output.state, without, remedy=remedy, inaccurate=inaccurate)
 
 
 def open_result(path: str | Path) -> xr.Dataset:
@@ -421,9 +366,6 @@ def open_result(path: str | Path) -> xr.Dataset:
     found = labelled(job.scene, buffer.lay_out(), {"digest": job.digest, "points_done": count})
     title = f"{job.scene.title} (unfinished: {count} of {job.total} points)"
     return with_pending(found).with_attrs(title=title).to_dataset()
-
-
-_BOUND, _VERDICT, _UNDECIDED = "spectral_radius_error", "verdict", 2
 
 
 def missed(out: Path, count: int, total: int) -> str:

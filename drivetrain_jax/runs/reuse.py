@@ -1,4 +1,4 @@
-"""Reuse points of another result: a longer axis, a finer grid, one more axis, a part of a sweep, or a longer list of points.
+"""Reuse points of another result: a longer axis, a finer grid, one more axis, a part of a sweep, or a list of points.
 
 Numerics (code, versions, instruction set), method, options and fixed values must be the same. Reused values meet the same
 tolerance as computed ones. Their last bits may differ, because the number of steps of a point depends on the points in its
@@ -16,15 +16,13 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.runs.assemble import sweep_first
+from drivetrain_jax.runs.assemble import misfits, sweep_first
 from drivetrain_jax.runs.axes import Grid, entry_of
 from drivetrain_jax.runs.identity import differences_of, not_valid
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.scene import Scene, restore_scene, result_variables
-from drivetrain_jax.store import checksums
-from drivetrain_jax.store.consolidate import map_variable, read_attribute
+from drivetrain_jax.store import checksums, consolidate
 from drivetrain_jax.store.files import digest
-from drivetrain_jax.store.zarr_store import is_store
 
 # Points that are copied at a time.
 _BLOCK = 1 << 18
@@ -35,13 +33,15 @@ _ROUNDINGS = 4 * np.finfo(float).eps
 class NotReusable(InputError):
     """Raised if no point of a result can be reused."""
 
+    def __init__(self, path: Path, why: str, allowed: str) -> None:
+        super().__init__(f"reuse = {str(path)!r}: {why}; allowed is {allowed}")
+
 
 class Damaged(NotReusable):
     """A damaged result; ``what`` names the damaged variables."""
 
     def __init__(self, path: Path, what: str) -> None:
-        allowed = "allowed is to restore the file or to compute it again"
-        super().__init__(f"reuse = {str(path)!r}: damaged ({what}); {allowed}")
+        super().__init__(path, f"damaged ({what})", "to restore the file or to compute it again")
         self.what = what
 
 
@@ -62,7 +62,7 @@ class ReusableResult:
 
     def blocks(self) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
         """Yield our points and their results in blocks, so that no result is loaded as a whole."""
-        arrays = {name: sweep_first(map_variable(self.path, name), self.grid) for name in self.names}
+        arrays = {name: sweep_first(consolidate.map_variable(self.path, name), self.grid) for name in self.names}
         for start in range(0, self.ours.size, _BLOCK):
             place = self.grid.place(self.theirs[start : start + _BLOCK])
             results = {name: np.array(array[place]) for name, array in arrays.items()}
@@ -128,109 +128,87 @@ def find(job: Job, path: Path) -> ReusableResult:
 
     Raises :class:`NotReusable`, or :class:`InputError` if there is no readable result.
     """
-    if not path.is_file():
-        raise NotReusable(f"reuse = {str(path)!r}: {_no_file(path)}")
-    names = ("scene", "digest", "drivetrain_jax_version", "numerics", "numerics_detail")
-    attrs = {name: read_attribute(path, name) for name in names}
-    if attrs["digest"] is None:
-        raise NotReusable(f"reuse = {str(path)!r}: not a result of drivetrain_jax; allowed is such a result")
-    scene = _same_computation(path, attrs, job)
-    _check_intact(path)
+    attrs = consolidate.read_attributes(path)
+    if "digest" not in attrs:
+        raise NotReusable(path, "not a result of drivetrain_jax", "such a result")
+    try:
+        scene = restore_scene(attrs.get("scene"))
+        reasons = differences_of(scene, attrs, job, points=False)
+    except InputError as error:
+        raise NotReusable(path, not_valid(error), "a result that differs in its points only") from None
+    if reasons:
+        raise NotReusable(path, reasons[0], "a result that differs in its points only")
+    # The checksums of the new result would hide damage.
+    if wrong := checksums.damaged(path) or misfits(consolidate.layout(path), scene):
+        raise Damaged(path, checksums.named(wrong))
+    if "checksums" not in attrs:
+        raise Damaged(path, "it has no checksums")
     grid = Grid.of(scene)
     theirs, ours = _same_points(scene, grid, job.scene, job.grid)
     if theirs.size:
-        outcome = sweep_first(map_variable(path, OUTCOME.name), grid)[grid.place(theirs)]
+        outcome = sweep_first(consolidate.map_variable(path, OUTCOME.name), grid)[grid.place(theirs)]
         kept = ~(outcome == Outcome.LOST).any(axis=tuple(range(1, outcome.ndim)))
         theirs, ours = theirs[kept], ours[kept]
     if not theirs.size:
-        raise NotReusable(f"reuse = {str(path)!r}: holds none of the points; allowed is a result that shares some")
+        raise NotReusable(path, "holds none of the points", "a result that shares some")
     wanted = set(scene.request.outputs) <= set(job.scene.request.outputs)
     is_covered = wanted and np.unique(theirs).size == grid.size
     stored = tuple(variable.name for variable in result_variables(job.scene))
     return ReusableResult(path, str(attrs["digest"]), stored, grid, theirs, ours, is_covered)
 
 
-def _same_computation(path: Path, attrs: Mapping[str, Any], job: Job) -> Scene:
-    """The scene of a result that differs from ``job`` in its points only."""
-    try:
-        scene = restore_scene(attrs["scene"])
-        reasons = differences_of(scene, attrs, job, points=False)
-    except InputError as error:
-        reasons = [not_valid(error)]
-    if reasons:
-        raise NotReusable(f"reuse = {str(path)!r}: {reasons[0]}; allowed is a result that differs in its points only")
-    return scene
+_NOTHING = np.empty(0, np.int64), np.empty(0, np.int64)
 
 
-def _no_file(path: Path) -> str:
-    if is_store(path):
-        return "is a Zarr store; allowed is the file that `drivetrain export` makes of it"
-    what = "is a folder" if path.is_dir() else "does not exist"
-    return f"{what}; allowed is a result written by `drivetrain run`"
-
-
-def _check_intact(path: Path) -> None:
-    """Raise :class:`Damaged` for a damaged source: the checksums of the new result would hide the damage."""
-    try:
-        wrong = checksums.damaged(path)
-    except InputError:
-        raise Damaged(path, "its structure") from None
-    if wrong or wrong is None:
-        raise Damaged(path, checksums.named(wrong) if wrong else "it has no checksums")
-
-
-def _same_points(scene: Scene, grid: Grid, our_scene: Scene, our_grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+def _same_points(theirs: Scene, grid: Grid, ours: Scene, our_grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of equal points of both grids; none if lines or fixed values differ."""
-    nothing = np.empty(0, np.int64), np.empty(0, np.int64)
-    if not (_same_lines(grid, our_grid) and _same_fixed(scene, our_scene)):
-        return nothing
-    if any(axis.also for axis in (*grid.axes, *our_grid.axes)):
-        # Positions are compared by one parameter an axis.
-        return nothing
-    if grid.zipped:
+    axes = {axis.name for axis in (*theirs.axes, *ours.axes)}
+    # Positions are compared by one parameter an axis.
+    several = any(axis.also for axis in (*grid.axes, *our_grid.axes))
+    if several or _line(grid) != _line(our_grid) or _constants(theirs, axes) != _constants(ours, axes):
+        return _NOTHING
+    if grid.zipped and our_grid.zipped:
         return _same_rows(grid, our_grid)
-    axes, ours = ({axis.name: axis.values for axis in each.axes} for each in (grid, our_grid))
-    # Position along each of their axes for each value along ours; -1 for none.
-    along = {name: _match(_values(scene, axes, name), values) for name, values in ours.items()}
-    constant = {name: _match(axes[name], _values(our_scene, ours, name))[:1] for name in axes.keys() - ours.keys()}
+    if not grid.zipped:
+        return _within(theirs, grid, ours, our_grid)
+    own, listed = _within(ours, our_grid, theirs, grid)
+    own, first = np.unique(own, return_index=True)
+    return listed[first], own
+
+
+def _within(scene: Scene, grid: Grid, other: Scene, points: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Points of ``grid``, an outer product, that ``points`` has too: their numbers in both."""
+    axes, columns = ({axis.name: axis.values for axis in each.axes} for each in (grid, points))
+    # Position along each axis for each value of the points; -1 for none.
+    along = {name: _match(_values(scene, axes, name), values) for name, values in columns.items()}
+    constant = {name: _match(axes[name], _values(other, columns, name))[:1] for name in axes.keys() - columns.keys()}
     if any(place.size == 0 or place[0] < 0 for place in constant.values()):
-        return nothing
-    if our_grid.zipped:
+        return _NOTHING
+    if points.zipped:
         chosen = np.flatnonzero(np.min([*along.values()], axis=0) >= 0)
         index = {name: place[chosen] for name, place in along.items()}
     else:
         kept = np.meshgrid(*(np.flatnonzero(place >= 0) for place in along.values()), indexing="ij")
-        chosen = np.ravel_multi_index([k.ravel() for k in kept], our_grid.shape) if kept else np.zeros(1, np.int64)
+        chosen = np.ravel_multi_index([k.ravel() for k in kept], points.shape) if kept else np.zeros(1, np.int64)
         index = {name: place[k.ravel()] for (name, place), k in zip(along.items(), kept, strict=True)}
     place = [np.broadcast_to({**constant, **index}[axis.name], chosen.shape) for axis in grid.axes]
-    theirs = np.ravel_multi_index(tuple(place), grid.shape) if place else np.zeros(chosen.shape, np.int64)
-    return np.asarray(theirs), np.asarray(chosen)
+    return np.ravel_multi_index(place, grid.shape) if place else np.zeros(chosen.shape, np.int64), chosen
 
 
-def _same_lines(grid: Grid, other: Grid) -> bool:
-    if grid.path is None or other.path is None:
-        return grid.path is other.path
-    same = grid.path.name == other.path.name and np.array_equal(grid.path.values, other.path.values)
-    return same and grid.path_is_fixed == other.path_is_fixed
+def _line(grid: Grid) -> tuple[Any, ...]:
+    """What identifies the path of a grid."""
+    return () if grid.path is None else (grid.path.name, grid.path.values.tolist(), grid.path_is_fixed)
 
 
-def _same_fixed(scene: Scene, other: Scene) -> bool:
-    """True if the parameters that neither scene varies agree, as far as the analysis uses them."""
-    varied = {axis.name for axis in (*scene.axes, *other.axes)}
-    used = scene.analysis.model(scene.system).parameters
-
-    def constant(values: Mapping[str, Any]) -> dict[str, Any]:
-        kept = {}
-        for name in used:
-            if name in varied or name not in values:
-                continue
-            value = values[name]
-            if isinstance(value, tuple):
-                value = tuple(None if f"{name}[{i}]" in varied else entry for i, entry in enumerate(value))
-            kept[name] = value
-        return kept
-
-    return constant(scene.fixed) == constant(other.fixed)
+def _constants(scene: Scene, varied: set[str]) -> dict[str, Any]:
+    """The parameters that the analysis uses, and list entries, unless they are ``varied``."""
+    used, entries = scene.analysis.model(scene.system).parameters, {}
+    for name, value in scene.fixed.items():
+        if isinstance(value, tuple):
+            entries |= {name: len(value)} | {f"{name}[{i}]": entry for i, entry in enumerate(value)}
+        else:
+            entries[name] = value
+    return {name: value for name, value in entries.items() if entry_of(name)[0] in used and name not in varied}
 
 
 def _values(scene: Scene, axes: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:
@@ -247,25 +225,25 @@ def _values(scene: Scene, axes: Mapping[str, np.ndarray], name: str) -> np.ndarr
 
 
 def _match(theirs: np.ndarray | None, ours: np.ndarray | None) -> np.ndarray:
-    """Position among ``theirs`` for each of ``ours``, -1 for none; a parameter that is not used has any value."""
+    """Position among ``theirs`` for each of ``ours`` within the tolerance of an axis, -1 for none.
+
+    A parameter that is not used (None) has any value.
+    """
     if theirs is None or ours is None:
         return np.zeros(1 if ours is None else len(ours), np.int64)
-    return _positions(theirs, ours) if theirs.size and ours.size else np.full(len(ours), -1)
-
-
-def _positions(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Position of each of ``wanted`` among ``values`` within the tolerance of an axis, -1 for none."""
-    order = np.argsort(values)
-    rising = values[order].astype(float)
-    right = np.clip(np.searchsorted(rising, wanted), 0, len(rising) - 1)
+    if not (theirs.size and ours.size):
+        return np.full(len(ours), -1)
+    order = np.argsort(theirs)
+    rising = theirs[order].astype(float)
+    right = np.clip(np.searchsorted(rising, ours), 0, len(rising) - 1)
     left = np.maximum(right - 1, 0)
-    nearest = np.where(abs(rising[left] - wanted) < abs(rising[right] - wanted), left, right)
-    sought, place = np.unique(np.asarray(wanted, float), return_inverse=True)
+    nearest = np.where(abs(rising[left] - ours) < abs(rising[right] - ours), left, right)
+    sought, place = np.unique(np.asarray(ours, float), return_inverse=True)
     own, other = _extents(rising)[nearest], _extents(sought)[place]
     # The ends of an axis are exact, its inner values have rounding errors; use the smaller tolerance of the two axes.
     extent = np.where((own > 0) & (other > 0), np.minimum(own, other), np.maximum(own, other))
-    room = _ROUNDINGS * (abs(rising[nearest]) + extent)
-    return np.where(abs(rising[nearest] - wanted) <= room, order[nearest], -1)
+    equal = abs(rising[nearest] - ours) <= _ROUNDINGS * (abs(rising[nearest]) + extent)
+    return np.where(equal, order[nearest], -1)
 
 
 def _extents(rising: np.ndarray) -> np.ndarray:
@@ -277,14 +255,10 @@ def _extents(rising: np.ndarray) -> np.ndarray:
 
 def _same_rows(grid: Grid, other: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Rows of a list of points for each equal row of another list that varies the same parameters."""
-    names = sorted(axis.name for axis in grid.axes)
-    if not other.zipped or names != sorted(axis.name for axis in other.axes):
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    theirs, ours = (
-        list(zip(*({a.name: a.values.tolist() for a in each.axes}[name] for name in names), strict=True))
-        for each in (grid, other)
-    )
-    place = {row: i for i, row in enumerate(theirs)}
-    pairs = [(place[row], i) for i, row in enumerate(ours) if row in place]
-    found = np.array(pairs, np.int64).reshape(-1, 2)
+    theirs, ours = ({axis.name: axis.values.tolist() for axis in each.axes} for each in (grid, other))
+    if theirs.keys() != ours.keys():
+        return _NOTHING
+    place = {row: i for i, row in enumerate(zip(*theirs.values(), strict=True))}
+    rows = zip(*(ours[name] for name in theirs), strict=True)
+    found = np.array([(place[row], i) for i, row in enumerate(rows) if row in place], np.int64).reshape(-1, 2)
     return found[:, 0], found[:, 1]

@@ -20,7 +20,7 @@ from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.reuse import ReusedPoints
 from drivetrain_jax.runs.scene import Scene, load_scene
 from drivetrain_jax.runs.stores import ZarrBlocks
-from drivetrain_jax.runs.work import Executor, Progress, Report, Threads, Work, make_executor
+from drivetrain_jax.runs.work import Progress, Report, Threads, Work, make_executor
 from drivetrain_jax.store.consolidate import open_result
 
 if TYPE_CHECKING:
@@ -81,7 +81,10 @@ def run(
     2
     """
     executor = make_executor(threads, workers, dask)
-    _check_output(out, reuse)
+    if out is not None and not isinstance(out, (str, PathLike)):
+        raise InputError(f"out = {shown(out)}: allowed is the path of a file")
+    if out is None and reuse:
+        raise InputError("reuse: given without out; allowed is a run into a file")
     with shown_progress(report) as show:
         if out is None:
             return _in_memory(_job(scene, overrides, on_disk=False), executor, show)
@@ -90,20 +93,13 @@ def run(
     return open_result(Path(out))
 
 
-def _check_output(out: object, reuse: object) -> None:
-    if out is not None and not isinstance(out, (str, PathLike)):
-        raise InputError(f"out = {shown(out)}: allowed is the path of a file")
-    if out is None and reuse:
-        raise InputError("reuse: given without out; allowed is a run into a file")
-
-
 def run_to_file(
     scene: str | Path | Mapping[str, Any] | Scene,
     out: Path,
     *,
     overrides: Mapping[str, Any] | None = None,
     fresh: bool = False,
-    executor: Executor | None = None,
+    executor: Threads | None = None,
     reuse: str | Path | Sequence[str | Path] = (),
     store: str | None = None,
     report: Report | None = None,
@@ -116,12 +112,11 @@ def run_to_file(
     output = Output(out, job, _store(out, store))
     if output.store == ZARR and not job.route.is_pointwise:
         raise InputError("store = 'zarr': not available for an atlas; allowed is hdf5, or a scene with direct solves")
-    output.restore()
     if not fresh and output.state == "complete":
         output.discard()
-        total = output.points(job.total)
+        total, outcomes = output.counted()
         progress = Progress(total, reused=total)
-        progress.count(output.outcomes)
+        progress.count(outcomes)
         return progress
     if not fresh and output.state == "stale":
         raise output.refusal
@@ -147,7 +142,7 @@ def _paths(reuse: str | Path | Sequence[str | Path]) -> Sequence[str | Path]:
     return paths
 
 
-def _into(output: Output, reused: ReusedPoints, fresh: bool, executor: Executor, report: Report | None) -> Progress:
+def _into(output: Output, reused: ReusedPoints, fresh: bool, executor: Threads, report: Report | None) -> Progress:
     """Start or resume the result of ``output``; the points ``reused`` are reused."""
     job, parts, progress = output.job, output.parts, _progress(output.job)
     begins = False
@@ -196,7 +191,7 @@ def _job(scene: str | Path | Mapping[str, Any] | Scene, overrides: Mapping[str, 
     return job
 
 
-def _in_memory(job: Job, executor: Executor, report: Report | None) -> xr.Dataset:
+def _in_memory(job: Job, executor: Threads, report: Report | None) -> xr.Dataset:
     progress = _progress(job)
     try:
         with Work(executor, report) as work:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -15,7 +16,7 @@ from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax.analysis import OUTCOME
 from drivetrain_jax.runs.assemble import PENDING, labelled, missing_value, template, with_pending
 from drivetrain_jax.runs.axes import Grid
-from drivetrain_jax.runs.job import Job, Results
+from drivetrain_jax.runs.job import Block, Job, Results
 from drivetrain_jax.runs.scene import restore_scene, result_variables
 from drivetrain_jax.store import checksums, zarr_store
 from drivetrain_jax.store.consolidate import ResultFile, read_attribute, release
@@ -42,6 +43,24 @@ class BlockStore(Protocol):
     def read(self, number: int) -> Results | None:
         """The results of a block; None if it is missing or damaged."""
         ...
+
+
+def stored_blocks(
+    store: BlockStore, job: Job, points: np.ndarray | None = None, first: int = 0, without: Container[int] = ()
+) -> Iterator[tuple[Block, Results]]:
+    """Yield the intact blocks of ``job``, or of some of its ``points``, ``without`` these numbers.
+
+    Numbers in the store start at ``first``. A block that does not fit the job counts as damaged.
+    """
+    numbers, variables = set(store.numbers()), result_variables(job.problem)
+    kinds = {v.name: (v.dtype, 1 + (job.grid.path is not None) + len(v.dims)) for v in variables}
+    for block in job.blocks(points) if numbers else ():
+        if first + block.number in numbers and block.number not in without:
+            found = store.read(first + block.number) or {}
+            if {name: (str(values.dtype), values.ndim) for name, values in found.items()} == kinds and {
+                *map(len, found.values())
+            } == {len(job.points(block))}:
+                yield block, found
 
 
 @dataclass(frozen=True)
@@ -105,7 +124,7 @@ class ZarrBlocks:
         return rows
 
     def finish(self, parts: PartsFolder, **attrs: str | float) -> None:
-        """Move the store into place. A former one is set aside first, because a directory cannot be replaced in one step.
+        """Move the store into place. A former one is moved away first, because a folder cannot be replaced in one step.
 
         Raises :class:`ChunkError` if a shard that a worker reported as written is missing.
         """
@@ -145,8 +164,8 @@ def export(store: Path, out: Path) -> int:
     if out.exists() or not out.parent.is_dir() or parts.holds_work():
         raise InputError(f"out = {str(out)!r}: allowed is a new file in an existing folder, without unfinished work")
     kept = {name: value for name, value in attrs.items() if name not in (zarr_store.SEAL, "coordinates")}
-    shapes, shards = zarr_store.result_shapes(store), zarr_store.shards_of(store)
-    zeros = {v.name: np.broadcast_to(np.zeros((), v.dtype), shapes[v.name]) for v in result_variables(scene)}
+    layout, shards = zarr_store.layout(store), zarr_store.shards_of(store)
+    zeros = {v.name: np.broadcast_to(np.zeros((), v.dtype), layout[v.name][1]) for v in result_variables(scene)}
     try:
         parts.open()
         with ResultFile(parts.result) as file:

@@ -108,8 +108,7 @@ def evaluate(
         uncovered.append(np.ravel_multi_index(tuple(lost.T), job.grid.shape))  # pyright: ignore[reportArgumentType]
         progress.computed += outcome.size - len(lost)
         progress.count(outcome[outcome != Outcome.LOST])
-        if work.report:
-            work.report(progress)
+        work.report(progress)
     rest = np.concatenate([np.empty(0, int), *uncovered])
     if rest.size and solve:
         work.do(job, buffer, progress, first, np.sort(rest))

@@ -181,8 +181,8 @@ def parse_value(text: str) -> Any:
     """A TOML value; other text is a number in short form (``.3``), a plain string (``18deg``) or a list of these."""
     try:
         content = tomllib.loads(f"value = {text}")
-    except ValueError:
-        # Not TOML, or a number with too many digits.
+    except (ValueError, RecursionError):
+        # Not TOML, a number with too many digits, or lists in lists in lists.
         content = {}
     if list(content) == ["value"]:
         return content["value"]

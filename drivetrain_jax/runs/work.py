@@ -6,7 +6,6 @@ import logging
 import re
 import time
 import uuid
-from collections import deque
 from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import ExitStack, closing
@@ -15,7 +14,7 @@ from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -28,9 +27,25 @@ from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import ResultBuffer, labelled
 from drivetrain_jax.runs.job import Block, Chunk, Job, Results
 from drivetrain_jax.runs.reuse import NO_REUSE, ReusedPoints
-from drivetrain_jax.runs.stores import BlockStore
+from drivetrain_jax.runs.stores import BlockStore, stored_blocks
 from drivetrain_jax.store.consolidate import ResultFile
 from drivetrain_jax.store.netcdf import Labelled
+
+# Most threads or processes, unless four a core are more.
+_MOST = 64
+# Tasks per worker: one is computed while the other waits, so no worker idles during writing.
+IN_FLIGHT = 2
+# Upper limits of queued chunks and of their bytes of results per thread: small chunks are computed faster than collected.
+_MOST_AHEAD, _BYTES_AHEAD = 32, 1 << 23
+
+# Seconds until a scheduler has answered. A busy one may answer late.
+_ANSWERED = 10.0
+_LOCAL = re.compile(r"local:([1-9]\d*)")
+# Loggers of Dask that report the death of a scheduler or worker; the run reports it in one line.
+_TALKATIVE = ("distributed", "tornado", "asyncio")
+
+# Blocks and their results in the order of completion.
+Finished = Generator[tuple[Block, Results | None], None, None]
 
 
 @dataclass
@@ -69,178 +84,14 @@ class Progress:
 Report = Callable[[Progress], None]
 
 
-class Receiver(Protocol):
-    """Receives results: the buffer of a scene, or a collector of solves."""
+class Threads:
+    """Computes blocks by threads of this process (default: one for each usable core), which share the chunks of a block.
 
-    def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
-        """Write the results of ``points``."""
-
-
-class Work:
-    """Runs blocks on the executor and reports progress. Leaving the context ends the workers.
-
-    With a ``store`` finished blocks are kept there, and blocks that it has are not computed again.
+    Executors have no effect on the numbers.
     """
 
-    def __init__(self, executor: Executor, report: Report | None = None, store: BlockStore | None = None) -> None:
-        self.executor, self.report, self.store = executor, report, store
-        self._begin = time.monotonic()
-
-    @property
-    def elapsed(self) -> float:
-        """Time since the start in s."""
-        return round(time.monotonic() - self._begin, 3)
-
-    def __enter__(self) -> Work:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.executor.close()
-
-    def do(
-        self,
-        job: Job,
-        receiver: Receiver | None,
-        progress: Progress,
-        first: int = 0,
-        points: np.ndarray | None = None,
-    ) -> None:
-        """Compute or reuse all blocks of ``job``, or of some of its ``points``, and hand their results to ``receiver``.
-
-        Without a receiver they are only stored. Numbers in the store start at ``first``.
-        """
-        done = set[int]()
-        length, left = job.grid.path_length, job.grid.size if points is None else len(points)
-        for block, results in self._stored(job, first, points, done):
-            done.add(block.number)
-            left -= len(results[OUTCOME.name])
-            if receiver is not None:
-                receiver.fill(job.points(block), results)
-            progress.reused += results[OUTCOME.name].size
-            progress.count(results[OUTCOME.name])
-        progress.cost, progress.total_cost, computed = 0.0, float(left * length), 0
-        self._report(progress)
-
-        def tick(count: int) -> None:
-            progress.cost += count * length
-            self._report(progress)
-
-        missing = (block for block in job.blocks(points) if block.number not in done)
-        try:
-            # Closed on exit: after an interrupt nothing further starts.
-            with closing(self.executor.run(job, missing, self.store, first, tick)) as finished:
-                for block, results in finished:
-                    results = self._received(job, block, results, first, receiver)
-                    done.add(block.number)
-                    outcome = results[OUTCOME.name]
-                    progress.count(outcome)
-                    progress.computed += outcome.size
-                    computed += outcome.size
-                    progress.cost = max(progress.cost, computed)
-                    self._report(progress)
-            if computed < progress.total_cost:
-                raise RetryableError("some blocks returned no result")
-        except KeyboardInterrupt:
-            # It may come between storing a block and counting it.
-            for _, results in self._stored(job, first, points, done):
-                progress.computed += results[OUTCOME.name].size
-                progress.count(results[OUTCOME.name])
-            raise
-
-    def _received(
-        self, job: Job, block: Block, results: Results | None, first: int, receiver: Receiver | None
-    ) -> Results:
-        """The results of a computed block, handed to ``receiver``; those of a lost one have no values."""
-        if results is None:
-            results = job.joined(block, (), ())
-            results[OUTCOME.name][...] = Outcome.LOST
-            if self.store is not None:
-                self.store.write(first + block.number, results)
-        if receiver is not None:
-            if len(results) == 1 and self.store is not None:
-                # A worker has stored the block.
-                results = self.store.read(first + block.number)
-                if results is None:
-                    where = f"every worker must see the folder {self.store.place!r}"
-                    raise RetryableError(f"block {block.number} is missing after a worker has stored it; {where}")
-            receiver.fill(job.points(block), results)
-        return results
-
-    def _stored(
-        self, job: Job, first: int, points: np.ndarray | None, without: Container[int]
-    ) -> Iterator[tuple[Block, Results]]:
-        """Yield the intact stored blocks ``without`` these numbers."""
-        stored = set(self.store.numbers()) if self.store is not None else set()
-        for block in job.blocks(points) if stored else ():
-            if self.store is None or first + block.number not in stored or block.number in without:
-                continue
-            results = self.store.read(first + block.number)
-            if results is not None and len(results[OUTCOME.name]) == len(job.points(block)):
-                yield block, results
-
-    def _report(self, progress: Progress) -> None:
-        if self.report:
-            self.report(progress)
-
-
-class Route:
-    """The way from a job to its result, chosen once by :func:`~drivetrain_jax.runs.resolve.resolve`: solves every point."""
-
-    # Name of the route; a part of the digest, because the route affects the bits.
-    name = "direct solves"
-    # True if points are solved one by one, so that partial results can be opened, reused and written by workers.
-    is_pointwise = True
-
-    def fill(
-        self, job: Job, buffer: ResultBuffer, work: Work, progress: Progress, reused: ReusedPoints
-    ) -> dict[str, str | int]:
-        """Copy the points ``reused`` and solve the others; returns attributes of the result."""
-        for points, results in reused.blocks():
-            buffer.fill(points, results)
-            progress.reused += results[OUTCOME.name].size
-            progress.count(results[OUTCOME.name])
-        work.do(job, buffer, progress, points=reused.others(job.grid.size))
-        return reused.attrs
-
-    def in_memory(self, job: Job, work: Work, progress: Progress) -> Labelled:
-        """The result."""
-        buffer = ResultBuffer(job.scene, job.grid)
-        extra = self.fill(job, buffer, work, progress, NO_REUSE)
-        return labelled(job.scene, buffer.lay_out(), job.attrs | extra)
-
-    def into_file(
-        self, job: Job, out: Path, temporary: Path, work: Work, progress: Progress, reused: ReusedPoints
-    ) -> None:
-        """Write the result from the points ``reused``, the stored blocks, and newly computed ones."""
-        with ResultFile(temporary) as file:
-            buffer = ResultBuffer(job.scene, job.grid, lambda blank: file.lay_out(blank.with_attrs(**job.attrs)))
-            extra = self.fill(job, buffer, work, progress, reused)
-            buffer.lay_out()
-            file.finish(out, wall_time_s=work.elapsed, **extra)
-
-
-DIRECT = Route()
-
-
-# Most threads or processes, unless four a core are more.
-_MOST = 64
-# Tasks per worker: one is computed while the other waits, so no worker idles during writing.
-IN_FLIGHT = 2
-# Upper limits of queued chunks and of their bytes of results per thread: small chunks are computed faster than collected.
-_MOST_AHEAD, _BYTES_AHEAD = 32, 1 << 23
-
-# Seconds until a scheduler has answered. A busy one may answer late.
-_ANSWERED = 10.0
-_LOCAL = re.compile(r"local:([1-9]\d*)")
-# Loggers of Dask that report the death of a scheduler or worker; the run reports it in one line.
-_TALKATIVE = ("distributed", "tornado", "asyncio")
-
-# Blocks and their results in the order of completion.
-Finished = Generator[tuple[Block, Results | None], None, None]
-
-
-class Executor(Protocol):
-    """Computes blocks, without effect on the numbers; workers start on first use."""
+    def __init__(self, count: int | None = None) -> None:
+        self._count = count
 
     def check(self) -> None:
         """Raise :class:`InputError` if no scheduler answers at the address."""
@@ -250,67 +101,44 @@ class Executor(Protocol):
     ) -> Finished:
         """Yield blocks and their results, which are also in the ``store``, if any, as number ``first`` + that of the block.
 
-        A worker that has stored the results yields the outcomes alone. Results are None for a block that killed every
-        process that computed it. Other failures are raised. ``tick`` is called with the number of points of every chunk that
-        this process computes. Blocks are drawn one by one. After the generator is closed (also by an interrupt) nothing
-        further is started.
+        ``tick`` is called with the number of points of every chunk. Blocks are drawn one by one; the chunks of the next one
+        start before the last ones of a block end. After the generator is closed (also by an interrupt) nothing further is
+        started.
         """
-        ...
+
+        def tasks() -> Iterator[tuple[_Open, int]]:
+            for block in blocks:
+                opened = _Open(block, job.plan(block), {})
+                job.prepare(opened.chunks)
+                # A block without chunks still has a task, because its results must be written.
+                yield from ((opened, position) for position in range(max(len(opened.chunks), 1)))
+
+        def compute(task: tuple[_Open, int]) -> Results:
+            opened, position = task
+            return job.compute(opened.chunks[position]) if opened.chunks else {}
+
+        with closing(run_threads(tasks(), compute, self._count or usable_cores())) as computed:
+            for (opened, position), found in computed:
+                opened.results[position] = found
+                count = len(opened.chunks)
+                if count:
+                    tick(opened.chunks[position].points.size)
+                if len(opened.results) >= count:
+                    results = job.joined(opened.block, opened.chunks, [opened.results[k] for k in range(count)])
+                    if store is not None:
+                        store.write(first + opened.block.number, results)
+                    yield opened.block, results
 
     def close(self) -> None:
         """End the workers."""
 
 
-class Threads(Executor):
-    """Threads of this process (default: one for each usable core), which share the chunks of a block."""
+class _Open(NamedTuple):
+    """A block in work, its chunks, and the results of those that are computed."""
 
-    def __init__(self, count: int | None = None) -> None:
-        self._count = count
-
-    def run(
-        self, job: Job, blocks: Iterable[Block], store: BlockStore | None, first: int, tick: Callable[[int], None]
-    ) -> Finished:
-        """Yield blocks and their results; the chunks of the next block start before the last ones of a block end."""
-        empty = deque[_Open]()
-
-        def chunks() -> Iterator[tuple[_Open, int]]:
-            for block in blocks:
-                opened = _Open(block, job.plan(block))
-                job.prepare(opened.chunks)
-                if not opened.chunks:
-                    empty.append(opened)
-                yield from ((opened, position) for position in range(len(opened.chunks)))
-
-        def finished(opened: _Open) -> tuple[Block, Results]:
-            results = job.joined(opened.block, opened.chunks, opened.in_order())
-            if store is not None:
-                store.write(first + opened.block.number, results)
-            return opened.block, results
-
-        computed = run_threads(chunks(), lambda at: job.compute(at[0].chunks[at[1]]), self._count or usable_cores())
-        try:
-            for (opened, position), results in computed:
-                opened.results[position] = results
-                tick(opened.chunks[position].points.size)
-                if len(opened.results) == len(opened.chunks):
-                    yield finished(opened)
-                while empty:
-                    yield finished(empty.popleft())
-            while empty:
-                yield finished(empty.popleft())
-        finally:
-            computed.close()
-
-
-class _Open:
-    """A block in work: its chunks, and the results of those that are computed."""
-
-    def __init__(self, block: Block, chunks: tuple[Chunk, ...]) -> None:
-        self.block, self.chunks = block, chunks
-        self.results = dict[int, Results]()
-
-    def in_order(self) -> list[Results]:
-        return [self.results[position] for position in range(len(self.chunks))]
+    block: Block
+    chunks: tuple[Chunk, ...]
+    results: dict[int, Results]
 
 
 def run_threads(
@@ -387,7 +215,7 @@ def compute(parcel: Parcel, block: Block, number: int) -> Results:
     return {OUTCOME.name: results[OUTCOME.name]}
 
 
-class Cluster(Executor):
+class Cluster(Threads):
     """A Dask cluster: the scheduler at ``tcp://host:port``, or ``local:N`` processes, connected until ``close``."""
 
     def __init__(self, address: str) -> None:
@@ -405,7 +233,7 @@ class Cluster(Executor):
     def run(
         self, job: Job, blocks: Iterable[Block], store: BlockStore | None, first: int, tick: Callable[[int], None]
     ) -> Finished:
-        """Yield blocks and their outcomes, without a store their results.
+        """Yield blocks and their outcomes, without a store their results; every worker stores what it computes.
 
         A block whose worker died is computed again. Results are None after too many deaths (Dask's setting
         ``distributed.scheduler.allowed-failures``). Exceptions are raised; a lost scheduler raises :class:`RetryableError`.
@@ -475,13 +303,14 @@ def _distributed() -> Any:
     return distributed
 
 
-def make_executor(threads: int | None = None, workers: int | None = None, dask: str | None = None) -> Executor:
+def make_executor(threads: int | None = None, workers: int | None = None, dask: str | None = None) -> Threads:
     """The executor: Dask at ``dask`` (``tcp://host:port`` or ``local:N``), ``workers`` for ``local:N``, or ``threads``.
 
     Raises :class:`InputError` for invalid or conflicting settings.
     """
     for name, value in (("threads", threads), ("workers", workers)):
-        if value is not None and not (_is_integer(value) and value >= 1):
+        is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+        if value is not None and not (is_integer and value >= 1):
             raise InputError(f"{name} = {shown(value)}: allowed is {name} >= 1, an integer")
         if value is not None and value > (most := max(_MOST, 4 * usable_cores())):
             raise InputError(f"{name} = {value}: allowed is {name} <= {most}, because more only wait for a core")
@@ -496,5 +325,143 @@ def make_executor(threads: int | None = None, workers: int | None = None, dask: 
     return Cluster(dask or f"local:{workers}")
 
 
-def _is_integer(value: object) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+class Receiver(Protocol):
+    """Receives results: the buffer of a scene, or a collector of solves."""
+
+    def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
+        """Write the results of ``points``."""
+
+
+class Work:
+    """Runs blocks on the executor and reports progress. Leaving the context ends the workers.
+
+    With a ``store`` finished blocks are kept there, and blocks that it has are not computed again.
+    """
+
+    def __init__(self, executor: Threads, report: Report | None = None, store: BlockStore | None = None) -> None:
+        self.executor, self.report, self.store = executor, report or (lambda _: None), store
+        self._begin = time.monotonic()
+
+    @property
+    def elapsed(self) -> float:
+        """Time since the start in s."""
+        return round(time.monotonic() - self._begin, 3)
+
+    def __enter__(self) -> Work:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.executor.close()
+
+    def do(
+        self,
+        job: Job,
+        receiver: Receiver | None,
+        progress: Progress,
+        first: int = 0,
+        points: np.ndarray | None = None,
+    ) -> None:
+        """Compute or reuse all blocks of ``job``, or of some of its ``points``, and hand their results to ``receiver``.
+
+        Without a receiver they are only stored. Numbers in the store start at ``first``.
+        """
+        done = set[int]()
+        length, left = job.grid.path_length, job.grid.size if points is None else len(points)
+        for block, results in self._stored(job, first, points, done):
+            done.add(block.number)
+            left -= len(results[OUTCOME.name])
+            if receiver is not None:
+                receiver.fill(job.points(block), results)
+            progress.reused += results[OUTCOME.name].size
+            progress.count(results[OUTCOME.name])
+        progress.cost, progress.total_cost, computed = 0.0, float(left * length), 0
+        self.report(progress)
+
+        def tick(count: int) -> None:
+            progress.cost += count * length
+            self.report(progress)
+
+        missing = (block for block in job.blocks(points) if block.number not in done)
+        try:
+            # Closed on exit: after an interrupt nothing further starts.
+            with closing(self.executor.run(job, missing, self.store, first, tick)) as finished:
+                for block, results in finished:
+                    results = self._received(job, block, results, first, receiver)
+                    done.add(block.number)
+                    outcome = results[OUTCOME.name]
+                    progress.count(outcome)
+                    progress.computed += outcome.size
+                    computed += outcome.size
+                    progress.cost = max(progress.cost, computed)
+                    self.report(progress)
+            if computed < progress.total_cost:
+                raise RetryableError("some blocks returned no result")
+        except KeyboardInterrupt:
+            # It may come between storing a block and counting it.
+            for _, results in self._stored(job, first, points, done):
+                progress.computed += results[OUTCOME.name].size
+                progress.count(results[OUTCOME.name])
+            raise
+
+    def _received(
+        self, job: Job, block: Block, results: Results | None, first: int, receiver: Receiver | None
+    ) -> Results:
+        """The results of a computed block, handed to ``receiver``; those of a lost one have no values."""
+        if results is None:
+            results = job.joined(block, (), ())
+            results[OUTCOME.name][...] = Outcome.LOST
+            if self.store is not None:
+                self.store.write(first + block.number, results)
+        if receiver is not None:
+            if len(results) == 1 and self.store is not None:
+                # A worker has stored the block.
+                results = self.store.read(first + block.number)
+                if results is None:
+                    where = f"every worker must see the folder {self.store.place!r}"
+                    raise RetryableError(f"block {block.number} is missing after a worker has stored it; {where}")
+            receiver.fill(job.points(block), results)
+        return results
+
+    def _stored(
+        self, job: Job, first: int, points: np.ndarray | None, without: Container[int]
+    ) -> Iterator[tuple[Block, Results]]:
+        return iter(()) if self.store is None else stored_blocks(self.store, job, points, first, without)
+
+
+class Route:
+    """The way from a job to its result, chosen once by :func:`~drivetrain_jax.runs.resolve.resolve`: solves every point."""
+
+    # Name of the route; a part of the digest, because the route affects the bits.
+    name = "direct solves"
+    # True if points are solved one by one, so that partial results can be opened, reused and written by workers.
+    is_pointwise = True
+
+    def fill(
+        self, job: Job, buffer: ResultBuffer, work: Work, progress: Progress, reused: ReusedPoints
+    ) -> dict[str, str | int]:
+        """Copy the points ``reused`` and solve the others; returns attributes of the result."""
+        for points, results in reused.blocks():
+            buffer.fill(points, results)
+            progress.reused += results[OUTCOME.name].size
+            progress.count(results[OUTCOME.name])
+        work.do(job, buffer, progress, points=reused.others(job.grid.size))
+        return reused.attrs
+
+    def in_memory(self, job: Job, work: Work, progress: Progress) -> Labelled:
+        """The result."""
+        buffer = ResultBuffer(job.scene, job.grid)
+        extra = self.fill(job, buffer, work, progress, NO_REUSE)
+        return labelled(job.scene, buffer.lay_out(), job.attrs | extra)
+
+    def into_file(
+        self, job: Job, out: Path, temporary: Path, work: Work, progress: Progress, reused: ReusedPoints
+    ) -> None:
+        """Write the result from the points ``reused``, the stored blocks, and newly computed ones."""
+        with ResultFile(temporary) as file:
+            buffer = ResultBuffer(job.scene, job.grid, lambda blank: file.lay_out(blank.with_attrs(**job.attrs)))
+            extra = self.fill(job, buffer, work, progress, reused)
+            buffer.lay_out()
+            file.finish(out, wall_time_s=work.elapsed, **extra)
+
+
+DIRECT = Route()

@@ -110,16 +110,26 @@ def release(arrays: Iterable[np.ndarray]) -> None:
             mapped.madvise(mmap.MADV_DONTNEED)
 
 
-def read_attribute(path: Path, name: str) -> str | None:
-    """A global attribute of the result at ``path``, or one of its details; None if it is missing.
+def read_attributes(path: Path) -> dict[str, Any]:
+    """The global attributes of the result at ``path`` with its details as texts and numbers.
 
     Raises :class:`InputError` if the file is not readable.
     """
     with opened(path) as file:
         # Older files have no group of details.
-        holds = file[GROUP] if name not in file.attrs and GROUP in file else file
-        value = holds.attrs.get(name)
-        return value.decode() if isinstance(value, bytes) else value
+        details = file[GROUP].attrs.items() if GROUP in file else ()
+        return {name: _plain(value) for name, value in (*details, *file.attrs.items())}
+
+
+def read_attribute(path: Path, name: str) -> Any:
+    """An attribute of :func:`read_attributes`; None if it is missing."""
+    return read_attributes(path).get(name)
+
+
+def layout(path: Path) -> dict[str, tuple[np.dtype, tuple[int, ...]]]:
+    """Types and shapes of all variables of the result at ``path``."""
+    with opened(path) as file:
+        return {name: (each.dtype, each.shape) for name, each in file.items() if isinstance(each, h5py.Dataset)}
 
 
 def read_variable(path: Path, name: str) -> np.ndarray:

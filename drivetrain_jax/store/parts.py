@@ -53,7 +53,8 @@ class BlockFiles:
     def read(self, number: int) -> Arrays | None:
         """The results of a block; None if it is missing or damaged."""
         for path in self._folder.glob(f"{number:08d}-*.npz"):
-            with suppress(OSError):
+            # Content with the digest of its name may still be no archive, for which NumPy raises exceptions of many kinds.
+            with suppress(Exception):
                 data = path.read_bytes()
                 if _digest(data) == path.stem.partition("-")[2]:
                     with np.load(io.BytesIO(data)) as file:

@@ -32,14 +32,9 @@ _CHECKSUMS, _OF_SHARDS, _RESULTS = "checksums", "checksums/shards", "results"
 _BROKEN = (ValueError, OSError, KeyError, RuntimeError, TypeError, AttributeError, IndexError, ArithmeticError)
 
 
-def was_store(path: Path) -> bool:
-    """True if the folders at ``path`` are those of a store, whose metadata may be damaged."""
-    return (path / _OF_SHARDS).is_dir() and (path / "outcome").is_dir()
-
-
 def is_store(path: Path) -> bool:
-    """True if there is a Zarr v3 group at ``path``."""
-    return (path / "zarr.json").is_file()
+    """True if there is a Zarr v3 group at ``path``, or the folders of a store whose metadata are damaged."""
+    return (path / "zarr.json").is_file() or ((path / _OF_SHARDS).is_dir() and (path / "outcome").is_dir())
 
 
 def create(path: Path, template: Labelled, shards: Shards, fills: Mapping[str, float]) -> None:
@@ -83,17 +78,18 @@ def shards_of(path: Path) -> Shards:
 
 
 def matches(path: Path, empty: Path) -> bool:
-    """True if the store at ``path`` has readable checksums, and the metadata and coordinates of the ``empty`` one."""
+    """True if the store at ``path`` is finished, or grows from the metadata and coordinates of the ``empty`` one."""
     try:
-        return done(path).shape == done(empty).shape and digest(_layout(path)) == digest(_layout(empty))
+        same = done(path).shape == done(empty).shape
+        return same and (is_sealed(path) or digest(_layout(path)) == digest(_layout(empty)))
     except (InputError, *_BROKEN):
         return False
 
 
-def result_shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    """Shapes of the results by name."""
+def layout(path: Path) -> dict[str, tuple[np.dtype, tuple[int, ...]]]:
+    """Types and shapes of the results by name."""
     root = _root(path)
-    return {name: tuple(root[name].shape) for name in root[_CHECKSUMS].attrs[_RESULTS]}
+    return {name: (root[name].dtype, tuple(root[name].shape)) for name in root[_CHECKSUMS].attrs[_RESULTS]}
 
 
 def write(path: Path, place: Place, arrays: Mapping[str, np.ndarray], shard: int | None) -> None:

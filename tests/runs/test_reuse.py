@@ -12,7 +12,7 @@ import drivetrain_jax as dt
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.runs.output import status
-from drivetrain_jax.runs.reuse import _positions
+from drivetrain_jax.runs.reuse import _match
 from drivetrain_jax.runs.run import Interrupted, run_to_file
 from drivetrain_jax.runs.work import Threads
 from drivetrain_jax.store import checksums
@@ -111,8 +111,8 @@ def test_distant_values_do_not_widen_the_tolerance_of_small_ones(tmp_path, old, 
 )
 def test_axis_values_equal_to_rounding_are_the_same(old, new):
     few, many = sorted((old, new), key=len)
-    assert (_positions(many, few) >= 0).all()
-    assert (_positions(few, many) >= 0).sum() == len(few)
+    assert (_match(many, few) >= 0).all()
+    assert (_match(few, many) >= 0).sum() == len(few)
 
 
 def test_values_are_reused_not_computed(tmp_path):
@@ -174,6 +174,11 @@ def test_lists_of_points(tmp_path):
     some = small | {"points": {"a": [1.0, 2.5], "b": [5.0, 5.0]}}
     assert counts(run_to_file(some, tmp_path / "some.nc", reuse=[tmp_path / "grid.nc"])) == (2, 1, 1)
     agree(tmp_path / "some.nc", some)
+    # A grid takes the points of a list, one that occurs twice once.
+    twice = small | {"points": {"a": [1.0, 1.0, 2.5], "b": [5.0, 5.0, 5.0]}}
+    run_to_file(twice, tmp_path / "twice.nc")
+    assert counts(run_to_file(grid, tmp_path / "g.nc", reuse=[tmp_path / "twice.nc", tmp_path / "r.nc"])) == (4, 2, 2)
+    agree(tmp_path / "g.nc", grid)
 
 
 ALONE = {"system": "toy", "analysis": "line"}
@@ -312,7 +317,7 @@ def test_paths_without_a_result_are_refused(tmp_path):
     for name, what in (
         ("nothing.nc", "does not exist"),
         (".", "is a folder"),
-        ("store", "is a Zarr store; allowed is"),
+        ("store", "a Zarr store; give the file that"),
     ):
         with pytest.raises(InputError, match=what):
             run_to_file(SMALL, tmp_path / "r.nc", reuse=[tmp_path / name])
@@ -377,6 +382,35 @@ def test_damaged_values_do_not_enter_another_result(tmp_path):
         del file.attrs["checksums"]
     with pytest.raises(InputError, match=r"damaged \(it has no checksums\)"):
         run_to_file(LARGE, tmp_path / "new.nc", reuse=[path])
+
+
+def _without_values(file):
+    del file["value"]
+
+
+def _of_other_shape(file):
+    del file["outcome"]
+    file.create_dataset("outcome", data=np.zeros((2, 2), np.int8))
+
+
+def _of_words(file):
+    del file["wave"]
+    file.create_dataset("wave", data=["a"] * 5)
+
+
+@pytest.mark.parametrize("change", [_without_values, _of_other_shape, _of_words])
+def test_content_with_valid_checksums_that_is_no_result_is_refused(tmp_path, change):
+    path = tmp_path / "r.nc"
+    run_to_file(SMALL, path)
+    with h5py.File(path, "r+") as file:
+        change(file)
+        checksums.seal(file)
+    with pytest.raises(InputError, match=r"reuse = .*: damaged \((value|outcome|wave)\)"):
+        run_to_file(LARGE, tmp_path / "new.nc", reuse=[path])
+    for scene_there in (SMALL, LARGE):
+        with pytest.raises(InputError, match=r"holds a damaged result \((value|outcome|wave)\); --fresh"):
+            run_to_file(scene_there, path)
+        assert status(scene_there, path).state == "stale"
 
 
 def test_damage_during_an_interrupted_growth_is_named(tmp_path):

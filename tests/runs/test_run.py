@@ -371,6 +371,23 @@ def test_a_link_stays_a_link_and_has_the_lock_of_its_file(grid_scene, tmp_path):
     assert link.is_symlink() and os.listdir(tmp_path / "data") == ["r.nc"]
 
 
+@pytest.mark.parametrize(
+    "other", [{}, {"value": np.zeros(2)}, {"value": np.zeros((16, 2)), "outcome": np.zeros(16, np.int8)}]
+)
+def test_a_whole_block_of_other_content_is_computed_again(tmp_path, other):
+    path, axes = tmp_path / "r.nc", {"b": {"values": [1.0, 3.0]}, "a": {"start": 0.0, "stop": 4.0, "num": 16}}
+    scene = {"system": "toy", "analysis": "toy", "outputs": ["value"], "axes": axes}
+    with pytest.raises(KeyboardInterrupt):
+        run_to_file(scene, path, executor=Threads(1), report=stop_after(1))
+    blocks = PartsFolder(path).blocks
+    for number in blocks.numbers():
+        next(Path(f"{path}.parts").glob(f"{number:08d}-*")).unlink()
+        blocks.write(number, other)
+    assert status(scene, path).done == 0
+    assert run_to_file(scene, path).computed == 32
+    assert_same(dt.open_result(path), dt.run(scene))
+
+
 def test_a_damaged_block_is_computed_again(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt) as stopped:

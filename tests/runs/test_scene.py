@@ -133,6 +133,8 @@ def test_text_of_a_mapping_is_its_scene(tmp_path, given, of):
         ("diffrax", "diffrax"),
         ("true", True),
         ("9" * 5000, math.inf),
+        ("[" * 5000, "[" * 5000),
+        ("[" * 5000 + "]" * 5000, "[" * 5000 + "]" * 5000),
     ],
 )
 def test_values_on_the_command_line(text, value):

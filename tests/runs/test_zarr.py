@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import warnings
-from pathlib import Path
 
 import pytest
 import xarray as xr
@@ -16,7 +15,7 @@ from drivetrain_jax import InputError
 from drivetrain_jax._threads import threads
 from drivetrain_jax.cli import main
 from drivetrain_jax.invariants.verify import verify
-from drivetrain_jax.runs import toml
+from drivetrain_jax.runs import stores, toml
 from drivetrain_jax.runs.assemble import PENDING
 from drivetrain_jax.runs.output import status
 from drivetrain_jax.runs.run import Incomplete, Interrupted, run, run_to_file
@@ -24,7 +23,6 @@ from drivetrain_jax.runs.stores import export
 from drivetrain_jax.runs.work import Threads
 from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.consolidate import read_attribute
-from drivetrain_jax.store.parts import PartsFolder
 from tests.sizes import full_after
 
 pytest.importorskip("zarr")
@@ -303,48 +301,25 @@ def test_a_store_that_workers_wrote_elsewhere_is_not_finished(grid_scene, tmp_pa
     assert not (tmp_path / "r.zarr").exists()
 
 
-def test_fresh_replaces_a_store_and_a_kill_keeps_the_former_one(grid_scene, tmp_path, monkeypatch):
-    path, other = tmp_path / "r.zarr", grid_scene | {"fixed": {"n": 4}}
+def test_a_kill_while_a_store_is_replaced_loses_no_block(grid_scene, tmp_path, monkeypatch):
+    path, other, move = tmp_path / "r.zarr", grid_scene | {"fixed": {"n": 4}}, stores.move_folder
     to_store(grid_scene, path)
     with pytest.raises(InputError, match=r"fixed.n is 4, was 3; --fresh replaces it"):
         to_store(other, path)
-    (tmp_path / "r.zarr.parts").mkdir()
-    path.rename(tmp_path / "r.zarr.parts" / "former")
-    assert status(grid_scene, path).state == "complete"
-    to_store(other, path, fresh=True)
-    assert status(other, path).state == "complete" and [p.name for p in tmp_path.iterdir()] == ["r.zarr"]
 
-
-def test_reading_while_a_store_is_replaced_moves_nothing(grid_scene, tmp_path, monkeypatch):
-    path, other, seen = tmp_path / "r.zarr", grid_scene | {"fixed": {"n": 4}}, []
-    to_store(grid_scene, path)
-    rename = Path.rename
-
-    def look(self, target):
-        moved = rename(self, target)
-        if Path(target).name == zarr_store.FORMER:
-            seen.append((status(other, path), status(grid_scene, path), dt.open_result(path), verify(path)))
-        return moved
+    def killed(folder, target):
+        if target == path:
+            raise KeyboardInterrupt
+        move(folder, target)
 
     with monkeypatch.context() as replacing:
-        replacing.setattr(Path, "rename", look)
-        assert to_store(other, path, fresh=True).computed == 123
-    ((ours, former, partial, report),) = seen
-    assert (ours.state, ours.done, former.state) == ("partial", 123, "complete")
-    assert partial.attrs["points_done"] == 123 and str(report).startswith("unfinished: ")
-    assert status(other, path).state == "complete" and [p.name for p in tmp_path.iterdir()] == ["r.zarr"]
-
-
-def test_a_run_restores_a_former_store_unless_another_run_is_working(grid_scene, tmp_path):
-    path = tmp_path / "r.zarr"
-    to_store(grid_scene, path)
-    parts = PartsFolder(path)
-    parts.open()
-    path.rename(parts.path / zarr_store.FORMER)
-    with pytest.raises(InputError, match="another run is working on it"):
-        to_store(grid_scene, path)
-    parts.close()
-    assert to_store(grid_scene, path).reused == 123 and [p.name for p in tmp_path.iterdir()] == ["r.zarr"]
+        replacing.setattr(stores, "move_folder", killed)
+        with pytest.raises(KeyboardInterrupt):
+            to_store(other, path, fresh=True)
+    assert not path.exists() and (status(other, path).done, status(grid_scene, path).state) == (123, "stale")
+    progress = to_store(other, path)
+    assert (progress.computed, progress.reused) == (0, 123) and [p.name for p in tmp_path.iterdir()] == ["r.zarr"]
+    assert status(other, path).state == "complete" and zarr_store.damage(path) == ""
 
 
 def test_the_command_line(tmp_path, monkeypatch, capsys):

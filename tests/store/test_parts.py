@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import pickle
 
 import numpy as np
@@ -48,6 +49,13 @@ def test_every_damaged_byte_is_noticed(folder):
     # The block is computed again, and lies beside the damaged file if its bytes differ.
     folder.blocks.write(0, {"outcome": np.ones(5, np.int8)})
     assert folder.blocks.numbers() == [0] and folder.blocks.read(0)["outcome"].all()
+
+
+@pytest.mark.parametrize("content", [b"", b"no archive", b"\x93NUMPY\x01\x00junk"])
+def test_content_with_its_digest_that_is_no_block_does_not_count(folder, content):
+    digest = hashlib.blake2b(content, digest_size=16).hexdigest()
+    (folder.path / f"00000000-{digest}.npz").write_bytes(content)
+    assert folder.blocks.numbers() == [0] and folder.blocks.read(0) is None
 
 
 def test_one_run_at_a_time(folder, tmp_path):
