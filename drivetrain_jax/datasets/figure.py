@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from drivetrain_jax import view
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import shown
-from drivetrain_jax.datasets.physical_axes import in_physical_data
-from drivetrain_jax.view.units import check_shown, in_given_units, in_units, listed
+from drivetrain_jax.datasets.resonances import LABELS, resonances
+from drivetrain_jax.view.units import check_shown, in_given_units, in_units, listed, size
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -156,10 +157,33 @@ def _place(source: Result, dataset: xr.Dataset) -> Path | xr.Dataset:
     return Path(source) if isinstance(source, (str, Path)) else dataset
 
 
+def in_physical_data(dataset: xr.Dataset, asked: Sequence[str]) -> xr.Dataset:
+    """``dataset`` with those dimensionless axes as physical data that then have one of the units ``asked`` for."""
+    axes = [dim for dim in dataset["outcome"].dims if dim in dataset.coords] if "outcome" in dataset else []
+    pure = [str(dim) for dim in axes if dataset[dim].attrs.get("units") == "1"]
+    data = {n: e["value"] for n, e in json.loads(dataset.attrs.get("physical_data", "{}")).items()}
+    if not (pure and data):
+        return dataset
+    # Local import: the modules import jax, which figures in the units of the file do not need.
+    from drivetrain_jax.runs.atlas_chart import in_physical_units
+    from drivetrain_jax.runs.scene import find_system
+
+    try:
+        physical = find_system(str(dataset.attrs.get("system"))).physical
+    except InputError:
+        return dataset
+    known = {n: e["value"] for n, e in json.loads(dataset.attrs.get("fixed_parameters", "{}")).items()} | data
+    for name in pure:
+        found = physical.back(name, known) if physical else None
+        if found is None or all(size(found[0].units, unit) is None for unit in asked):
+            continue
+        # Predictions along the parameter are computed again along the quantity.
+        dataset = in_physical_units(dataset.drop_vars([LABELS, f"{LABELS}_{name}"], errors="ignore"), name, *found)
+    return dataset
+
+
 def _with_resonances(dataset: xr.Dataset) -> xr.Dataset:
     """``dataset`` with the predicted resonances of its system, which older files already contain."""
-    from drivetrain_jax.datasets.resonances import LABELS, resonances
-
     if dataset.attrs.get("analysis") not in _PREDICTED or LABELS in dataset.coords:
         return dataset
     found = resonances(dataset)

@@ -14,8 +14,7 @@ import matplotlib as mpl
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.datasets.figure import drawn
-from drivetrain_jax.datasets.physical_axes import in_physical_data
+from drivetrain_jax.datasets.figure import drawn, in_physical_data
 from drivetrain_jax.report.statements import amplitudes, statements
 from drivetrain_jax.report.tables import Table, axes_table, fixed_table, values_tables
 from drivetrain_jax.store import checksums
