@@ -124,10 +124,10 @@ def integrate(model: Any, state: Any, end: Any, rtol: Any, events: bool) -> tupl
         drive = model.B0 + model.B1 * jnp.cos(model.omega * t)
         return jnp.stack([y[1], drive - model.damping * y[1] - model.stiffness * spring])
 
-    def distance(t: Any, y: Any, side: Any, upper: bool, **_: Any) -> Any:
-        """Distance to the upper or the lower flank of the region, positive inside."""
-        above = jnp.where(side > 0, jnp.inf, jnp.where(side == 0, model.b, -model.b) - y[0])
-        below = jnp.where(side < 0, jnp.inf, y[0] - jnp.where(side == 0, -model.b, model.b))
+    def distance(t: Any, y: Any, args: Any, upper: bool, **_: Any) -> Any:
+        """Distance to the upper or the lower flank of the region ``args``, positive inside."""
+        above = jnp.where(args > 0, jnp.inf, jnp.where(args == 0, model.b, -model.b) - y[0])
+        below = jnp.where(args < 0, jnp.inf, y[0] - jnp.where(args == 0, -model.b, model.b))
         return jnp.minimum(above if upper else below, 1e3)
 
     event = diffrax.Event(
