@@ -204,11 +204,11 @@ class LinearPeriodic(eqx.Module):
         is_pair = len(matrix) == 2 * half and all(isinstance(x, int | float) and x == one for x, one in upper)
         return unit if is_pair else None
 
-    def ends(self) -> tuple[Rows, Rows] | None:
-        """``R0`` and ``R1`` of the reversal, or the reversor twice; None over a whole period."""
+    def ends(self) -> Array | None:
+        """``R0`` and ``R1`` of the reversal, or the reversor twice, ``(2, n, n, ...)``; None over a whole period."""
         if self.reversal is not None:
-            return self.reversal()
-        return None if self.reversor is None else (self.reversor, self.reversor)
+            return jnp.stack(jnp.broadcast_arrays(*map(dense, self.reversal())))
+        return None if self.reversor is None else jnp.asarray((self.reversor, self.reversor))
 
     @property
     def exchanges_halves(self) -> bool:

@@ -11,7 +11,7 @@ batch, and may be part of a kernel.
 from __future__ import annotations
 
 from functools import partial, reduce
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,10 +24,7 @@ from drivetrain_jax.analysis.floquet.multipliers import (
     root_scale,
 )
 from drivetrain_jax.analysis.numerics.kernels import stored
-from drivetrain_jax.analysis.numerics.linear_algebra import square_sum
-
-if TYPE_CHECKING:
-    from drivetrain_jax.systems._models import Rows
+from drivetrain_jax.analysis.numerics.linear_algebra import matmul, square_sum
 
 # Rounding of the entries of A, in units of the last place. A search for the worst points showed that half is too little.
 _ENTRIES = 16
@@ -82,22 +79,12 @@ def unknown(n: int) -> Monodromy:
     return Monodromy(none, zero, jnp.array(jnp.inf), jnp.array(False), zero, none)
 
 
-def assemble(ends: tuple[Rows, Rows] | None, phi: Array) -> Array:
+def assemble(ends: Array | None, phi: Array) -> Array:
     """The monodromy matrix, up to similarity, from the propagator over the span: ``Phi``, or ``R0 Phi^T R1 Phi``."""
     if ends is None:
         return phi
-    start, end = ends
-    turned = times(end, phi)
-    inner = sum(phi[j][:, None] * turned[j] for j in range(len(phi)))
-    return jnp.stack(times(start, inner))  # pyright: ignore[reportArgumentType]
-
-
-def times(rows: Rows, matrix: Array) -> list[Array]:
-    """The rows of ``rows @ matrix``, without the products with the numbers 0."""
-    return [
-        sum(entry * matrix[j] for j, entry in enumerate(row) if not isinstance(entry, int | float) or entry)
-        for row in rows
-    ]  # pyright: ignore[reportReturnType]
+    start, end = ends.reshape(*ends.shape[:3], *(ends.shape[3:] or (1,) * (phi.ndim - 2)))
+    return matmul(start, matmul(jnp.swapaxes(phi, 0, 1), matmul(end, phi)))
 
 
 def _balance(size: Array) -> Array:
@@ -105,14 +92,17 @@ def _balance(size: Array) -> Array:
 
     Two sweeps of Osborne's iteration (Parlett & Reinsch, Numer. Math. 13, 1969).
     """
-    scales = [jnp.ones(size.shape[2:])] * len(size)
-    for k in 2 * list(range(len(size))):
-        others = [j for j in range(len(size)) if j != k]
-        row = sum(size[k, j] * scales[j] for j in others) / scales[k]
-        column = sum(size[j, k] / scales[j] for j in others) * scales[k]
+    n, axes = len(size), (1,) * (size.ndim - 2)
+    size = size * (1 - np.eye(n)).reshape(n, n, *axes)
+
+    def balanced(k: Array, scales: Array) -> Array:
+        row = sum(size[:, j] * scales[j] for j in range(n)) / scales
+        column = sum(size[j] / scales[j] for j in range(n)) * scales
         factor = jnp.sqrt(row / column)
-        scales[k] = scales[k] * jnp.where((row > 0) & (column > 0) & jnp.isfinite(factor), factor, 1.0)
-    return jnp.stack(scales)
+        chosen = (np.arange(n).reshape(n, *axes) == k % n) & (row > 0) & (column > 0) & jnp.isfinite(factor)
+        return jnp.where(chosen, scales * factor, scales)
+
+    return jax.lax.fori_loop(0, 2 * n, balanced, jnp.ones_like(size[0]))
 
 
 def _scaled(matrix: Array, scales: Array) -> Array:
@@ -121,7 +111,7 @@ def _scaled(matrix: Array, scales: Array) -> Array:
 
 
 def compare(
-    ends: tuple[Rows, Rows] | None,
+    ends: Array | None,
     log_determinant: Array | None,
     coarse: Propagator,
     fine: Propagator,
@@ -141,8 +131,7 @@ def compare(
     """
     halves, n = (1 if ends is None else 2), len(fine.matrix)
     z_fine, z_coarse = (stored(partial(assemble, ends))(phi) for phi in (fine.matrix, coarse.matrix))
-    magnitudes = jax.tree.map(lambda x: abs(x) if isinstance(x, int | float) else jnp.abs(x), ends)
-    size = stored(partial(assemble, magnitudes))(jnp.abs(fine.matrix))
+    size = stored(partial(assemble, None if ends is None else jnp.abs(ends)))(jnp.abs(fine.matrix))
     scales = stored(_balance)(size)
     plain = z_fine, z_fine - z_coarse
     z_fine, z_coarse, size = (stored(_scaled)(matrix, scales) for matrix in (z_fine, z_coarse, size))

@@ -32,9 +32,9 @@ from drivetrain_jax.analysis.numerics.linear_algebra import matmul, square_sum
 
 VERDICTS = ("stable", "unstable", "undecided")
 
-# Radii of the circles relative to the spectral radius: four per decade from rounding up to 10, 1 % below powers of ten so
+# Radii of the circles relative to the spectral radius: four per decade from 10 down to rounding, 1 % below powers of ten so
 # that a bound can meet a decimal tolerance.
-_LADDER = 0.99 * 10.0 ** (np.arange(-64, 5) / 4)
+_LARGEST, _STEP, _COUNT = 9.9, 10**-0.25, 69
 
 
 def characteristic_polynomial(z: Array) -> tuple[Array, Array]:
@@ -43,16 +43,18 @@ def characteristic_polynomial(z: Array) -> tuple[Array, Array]:
     By the recursion of Faddeev and Le Verrier, N_k = Z N_(k-1) + a_k I, where ``-N_(k-1)^T`` is the derivative of a_k by the
     entries of Z. Its size is ``|N_(k-1)|/sqrt(n)``, 1 for the trace.
     """
-    n = z.shape[0]
-    unit = np.eye(n).reshape(n, n, *(1,) * (z.ndim - 2))
-    power, coefficients, slopes = z, [], [jnp.ones(z.shape[2:])]
-    for k in range(1, n + 1):
+    n, axes = len(z), (1,) * (z.ndim - 2)
+    unit, number = np.eye(n).reshape(n, n, *axes), np.arange(1, n + 1).reshape(n, *axes)
+
+    def onward(k: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        power, coefficients, slopes = state
         a = -sum(power[i, i] for i in range(n)) / k
-        coefficients.append(a)
-        if k < n:
-            slopes.append(jnp.sqrt(square_sum(power + a * unit) / n))
-            power = matmul(z, power) + a * z
-    return jnp.stack(coefficients), jnp.stack(slopes)
+        following = power + a * unit
+        slopes = jnp.where(number == k + 1, jnp.sqrt(square_sum(following) / n), slopes)
+        return matmul(z, following), jnp.where(number == k, a, coefficients), slopes
+
+    start = z, jnp.zeros_like(z[0]), jnp.ones_like(z[0])
+    return jax.lax.fori_loop(1, n + 1, onward, start)[1:]
 
 
 def characteristic_coefficients(z: Array) -> Array:
@@ -80,74 +82,52 @@ def sort_multipliers(real: Array, imaginary: Array) -> Array:
     return jnp.take_along_axis(real + 1j * imaginary, order, axis=0)
 
 
+def over_first(operation: Callable[[Array, Array], Array], x: Array) -> Array:
+    """``operation`` of all entries along the first axis; unlike a reduction it may be part of a kernel."""
+    return reduce(operation, (x[i] for i in range(len(x))))
+
+
 def spectral_radius_bound(real: Array, imaginary: Array, error: Array) -> Array:
     """Bound of the error of ``rho``, the largest modulus of the multipliers ``real + i imaginary``, ``(n, ...) -> (...)``.
 
     ``error`` bounds the errors of the coefficients a_k in units of rho^k. The result is at least four roundings of rho,
     and inf if no circle of the ladder is certified.
     """
-    n = real.shape[0]
-    modulus = jnp.hypot(real, imaginary)
-    rho = jnp.max(modulus, axis=0)
-    modulus, x, y = modulus / rho, real / rho, imaginary / rho
-
-    def eps(r: Array) -> Array:
-        # Both circles lie within |z| <= 1 + r, where sum_k error |z|^(n-k) <= n error (1 + r)^(n-1).
-        return n * error * (1 + r) ** (n - 1)
-
-    radius = jnp.maximum(_circle_around_all(modulus, x, y, eps), _circle_around_largest(modulus, x, y, eps))
-    return rho * (radius + 4 * np.finfo(float).eps)
-
-
-def _circle_around_all(modulus: Array, x: Array, y: Array, eps: Callable[[Array], Array]) -> Array:
-    """Smallest r of the ladder such that ``|z| <= 1 + r`` holds all zeros; multipliers ``x + i y`` are in units of rho."""
-    n, ladder = len(x), jnp.asarray(_LADDER)
+    n, rho = len(real), over_first(jnp.maximum, jnp.hypot(real, imaginary))
+    x, y = real / rho, imaginary / rho
+    modulus, own = jnp.hypot(x, y), _diagonal(n, rho.ndim)
     gap = jnp.hypot(x[:, None] - x, y[:, None] - y)
-    closest = jnp.stack([jnp.min(jnp.delete(gap[i], i, axis=0), axis=0, initial=jnp.inf) for i in range(n)])
-
-    def outside(r: Array) -> Array:
-        reach = 1 + r - modulus
-        margin = jnp.where((reach < closest / 32)[:, None], gap - reach[:, None], gap / 2)
-        products = [
-            reach[i] * math.prod(jnp.maximum(reach[j], margin[i, j]) for j in range(n) if j != i) for i in range(n)
-        ]
-        return jnp.min(jnp.stack(products), axis=0) > eps(r)
-
-    def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
-        # The condition is monotone in r: bisect for the first radius that meets it.
-        low, high = bracket
-        middle = (low + high) // 2
-        met = outside(ladder[middle])
-        return jnp.where(met, low, middle), jnp.where(met, middle, high)
-
-    first = jnp.full(modulus.shape[1:], -1), jnp.full(modulus.shape[1:], ladder.size)
-    rung = jax.lax.fori_loop(0, math.ceil(math.log2(ladder.size)) + 1, halve, first)[1]
-    return jnp.where(rung < ladder.size, ladder[jnp.minimum(rung, ladder.size - 1)], jnp.inf)
-
-
-def _circle_around_largest(modulus: Array, x: Array, y: Array, eps: Callable[[Array], Array]) -> Array:
-    """Smallest r of the ladder such that a zero lies within r of the largest multiplier."""
-    n = len(x)
+    closest = over_first(jnp.minimum, jnp.where(own, jnp.inf, gap))
     x1, y1, top = x[0], y[0], modulus[0]
     for j in range(1, n):
         larger = modulus[j] > top
         x1, y1, top = (jnp.where(larger, new, old) for new, old in ((x[j], x1), (y[j], y1), (modulus[j], top)))
-    return _circle_around(jnp.hypot(x - x1, y - y1), eps)
+
+    def certified(r: Array, eps: Array) -> Array:
+        """For ``|z| <= 1 + r``, and for the circle about the largest multiplier; the unit is rho."""
+        reach = 1 + r - modulus
+        margin = jnp.where((reach < closest / 32)[:, None], gap - reach[:, None], gap / 2)
+        factors = jnp.where(own, reach, jnp.maximum(reach, margin))
+        least = over_first(jnp.minimum, over_first(jnp.multiply, jnp.swapaxes(factors, 0, 1)))
+        return jnp.stack([least, over_first(jnp.multiply, jnp.abs(jnp.hypot(x - x1, y - y1) - r))]) > eps
+
+    radii = _smallest_radii(certified, jnp.stack([rho, rho]), n, error)
+    return rho * (over_first(jnp.maximum, radii) + 4 * np.finfo(float).eps)
 
 
-def _circle_around(distances: Array, eps: Callable[[Array], Array]) -> Array:
-    """Smallest r of the ladder such that the circle of this radius about a multiplier holds as many zeros as multipliers.
+def _diagonal(n: int, axes: int) -> np.ndarray:
+    return np.eye(n, dtype=bool).reshape(n, n, *(1,) * axes)
 
-    ``distances`` ``(n, ...)`` of all multipliers from it contain the 0 of its own, so the product over all of them has the
-    factor r.
-    """
-    n, ladder = len(distances), jnp.asarray(_LADDER)
 
-    def descend(k: int, inner: Array) -> Array:
-        r = ladder[ladder.size - 1 - k]
-        return jnp.where(math.prod(jnp.abs(distances[j] - r) for j in range(n)) > eps(r), r, inner)
+def _smallest_radii(certified: Callable[[Array, Array], Array], like: Array, n: int, error: Array) -> Array:
+    """The smallest r of the ladder for which each of the conditions ``certified(r, eps)`` holds, or inf."""
 
-    return jax.lax.fori_loop(0, ladder.size, descend, jnp.full(distances.shape[1:], jnp.inf))
+    def descend(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        r, radii = state
+        # All circles lie within |z| <= 1 + r, where sum_k error |z|^(n-k) <= n error (1 + r)^(n-1).
+        return r * _STEP, jnp.where(certified(r, n * error * (1 + r) ** (n - 1)), r, radii)
+
+    return jax.lax.fori_loop(0, _COUNT, descend, (jnp.asarray(_LARGEST), jnp.full_like(like, jnp.inf)))[1]
 
 
 def multiplier_errors(real: Array, imaginary: Array, error: Array) -> Array:
@@ -155,12 +135,14 @@ def multiplier_errors(real: Array, imaginary: Array, error: Array) -> Array:
 
     ``error`` as in :func:`spectral_radius_bound`.
     """
-    n = len(real)
-    rho = jnp.max(jnp.hypot(real, imaginary), axis=0)
+    rho = over_first(jnp.maximum, jnp.hypot(real, imaginary))
     distances = jnp.hypot(real[:, None] - real, imaginary[:, None] - imaginary) / rho
-    # All circles of use lie within |z| <= 1 + r, as those of the spectral radius.
-    radius = _circle_around(distances, lambda r: n * error * (1 + r) ** (n - 1))
-    return rho * (radius + 4 * np.finfo(float).eps)
+
+    def certified(r: Array, eps: Array) -> Array:
+        # The distance of a multiplier from itself is 0, so each product has the factor r.
+        return over_first(jnp.multiply, jnp.abs(distances - r)) > eps
+
+    return rho * (_smallest_radii(certified, real, len(real), error) + 4 * np.finfo(float).eps)
 
 
 def all_on_the_circle(real: Array, imaginary: Array, error: Array, scale: Array) -> Array:
@@ -168,14 +150,12 @@ def all_on_the_circle(real: Array, imaginary: Array, error: Array, scale: Array)
 
     ``error`` as in :func:`spectral_radius_bound`.
     """
-    n = len(real)
-    modulus = jnp.hypot(real, imaginary)
     radius = multiplier_errors(real, imaginary, error)
     gaps = jnp.hypot(real[:, None] - real, imaginary[:, None] - imaginary)
-    gaps = jnp.where(jnp.eye(n, dtype=bool).reshape(n, n, *(1,) * (real.ndim - 1)), jnp.inf, gaps)
     # Four radii about a multiplier at the unit circle contain the reflection of its circle if that is below 0.1.
-    apart = (scale * radius < 0.1) & jnp.all(gaps > 4 * radius[:, None] + radius, axis=1)
-    return jnp.all(apart & (jnp.abs(scale * modulus - 1) <= scale * radius), axis=0)
+    apart = _diagonal(len(real), real.ndim - 1) | (gaps > 4 * radius + radius[:, None])
+    on_circle = (scale * radius < 0.1) & (jnp.abs(scale * jnp.hypot(real, imaginary) - 1) <= scale * radius)
+    return over_first(jnp.logical_and, on_circle & over_first(jnp.logical_and, apart))
 
 
 def verdict(rho: Array, error: Array) -> Array:

@@ -22,7 +22,7 @@ from jax import Array
 
 from drivetrain_jax.analysis.floquet.direct import Monodromy, Propagator, compare, unknown
 from drivetrain_jax.analysis.numerics.collocation import Scheme, first_order, gauss, panel, second_order
-from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, on_cpu, stored, suits_one_kernel
+from drivetrain_jax.analysis.numerics.kernels import any_lane, in_one_kernel, on_cpu, stored, suits_one_kernel
 from drivetrain_jax.analysis.numerics.lanes import Constants, blocks_first, blocks_joined, lanes_last, traced_once
 from drivetrain_jax.analysis.numerics.linear_algebra import largest, matmul
 from drivetrain_jax.analysis.numerics.staged import staged
@@ -157,16 +157,12 @@ def _refined(fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array, Arra
     size = LANES if lanes > LANES and on_cpu() else lanes
     blocks = jax.tree.map(lambda x: blocks_first(x, size) if x.ndim and x.shape[-1] == lanes else x, arrays)
     marches: list[Panels] = []
-    numbers: list[Any] = []
 
     def prepared(arrays: LinearPeriodic) -> tuple[Any, Any, Any]:
         """Values that do not change during the march, for all blocks at once."""
         system = eqx.combine(arrays, fixed.tree)
         marches[:] = [Panels(part) for part in system.parts]
-        # Numbers among the entries stay known while the kernel is traced.
-        ends, known = eqx.partition(system.ends(), eqx.is_array)
-        numbers[:] = [known]
-        return [march.fixed for march in marches], ends, system.log_determinant and system.log_determinant()
+        return [march.fixed for march in marches], system.ends(), system.log_determinant and system.log_determinant()
 
     axes = jax.tree.map(lambda x, cut: 0 if cut.ndim > x.ndim else None, arrays, blocks)
     leaves, tree = jax.tree.flatten(jax.vmap(prepared, (axes,), axis_size=-(-lanes // size))(blocks))
@@ -178,7 +174,7 @@ def _refined(fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array, Arra
         def block(packed: list[Array]) -> tuple[Array, Monodromy]:
             rows = {kind: iter(stack) for kind, stack in zip(kinds, packed, strict=True)}
             values, ends, determinant = jax.tree.unflatten(tree, [next(rows[x.shape]) for x in leaves])
-            return _agreeing(marches, values, eqx.combine(ends, numbers[0]), determinant, size, *shared)
+            return _agreeing(marches, values, ends, determinant, size, *shared)
 
         return jax.lax.map(block, packed)
 
@@ -190,7 +186,7 @@ def _refined(fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array, Arra
 def _agreeing(
     marches: list[Panels],
     fixed: list[Fixed],
-    ends: Any,
+    ends: Array | None,
     determinant: Array | None,
     lanes: int,
     panels: Array,
@@ -210,7 +206,7 @@ def _agreeing(
     def unfinished(state: tuple) -> Array:
         number, count, propagator, found = state
         going = ~found.met & (jnp.isfinite(propagator.matrix[0, 0]) | (number < 4))
-        return (number < 2) | ((number < 2 + _MAX_REFINEMENTS) & (count <= MAX_PANELS) & _any(going))
+        return (number < 2) | ((number < 2 + _MAX_REFINEMENTS) & (count <= MAX_PANELS) & any_lane(going))
 
     def refine(state: tuple) -> tuple:
         number, count, coarse, _ = state
@@ -233,15 +229,6 @@ def _agreeing(
     none = jax.tree.map(lambda x: jnp.broadcast_to(x[..., None], (*x.shape, lanes)), unknown(n))
     _, _, propagator, found = jax.lax.while_loop(unfinished, refine, (jnp.int32(0), first, start, none))
     return propagator.matrix, found
-
-
-def _any(flags: Array) -> Array:
-    """True if any of ``flags`` ``(lanes,)`` is, by slices: a reduction cannot be part of a kernel."""
-    while len(flags) > 1:
-        half = len(flags) // 2
-        folded = flags[:half] | flags[half : 2 * half]
-        flags = folded if len(flags) % 2 == 0 else jnp.concatenate([folded[:-1], folded[-1:] | flags[-1:]])
-    return flags[0]
 
 
 class _State(NamedTuple):
@@ -363,7 +350,9 @@ class Panels:
         records_now = state.covariance, state.stiffness, state.decay
         covariance, stiffness, decay = jax.lax.cond(records, recorded, lambda: records_now)
         # Logarithms cost as much as half a panel.
-        log_scale = jax.lax.cond(_any(factor != 1), lambda: state.log_scale - jnp.log(factor), lambda: state.log_scale)
+        log_scale = jax.lax.cond(
+            any_lane(factor != 1), lambda: state.log_scale - jnp.log(factor), lambda: state.log_scale
+        )
         return _State(matrix, log_scale, covariance, stiffness, decay)
 
     def _rates(self, coefficients: tuple[Array, ...]) -> tuple[Array, Array]:

@@ -7,7 +7,8 @@ The bound follows from the error of the coefficients of the characteristic polyn
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from functools import reduce
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -23,11 +24,12 @@ from drivetrain_jax.analysis.floquet.multipliers import (
     all_on_the_circle,
     characteristic_coefficients,
     multiplier_errors,
+    over_first,
     sort_multipliers,
     spectral_radius_bound,
     verdict,
 )
-from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, stored
+from drivetrain_jax.analysis.numerics.kernels import any_lane, in_one_kernel, stored
 from drivetrain_jax.analysis.numerics.lanes import in_blocks
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, square_sum
 from drivetrain_jax.systems import System
@@ -40,8 +42,8 @@ Spectrum = tuple[Array, Array]
 Radius = tuple[Array, Array]
 # Roundings in a coefficient, in units of eps times a power of the matrix's norm.
 _ROUNDINGS = 16.0
-# Lanes per block of the closed form, and lanes whose eigenvalues are computed together.
-_BLOCK, _REPAIRED = 32, 32
+# Lanes per block of the closed form, and steps of its iteration in the second pass.
+_BLOCK, _MORE_STEPS = 32, 60
 
 
 def has_closed_form(z: Array) -> bool:
@@ -51,48 +53,69 @@ def has_closed_form(z: Array) -> bool:
 
 def radius_by_eigenvalues(spectrum: Spectrum, error: Array) -> Radius:
     """Spectral radius and bound; ``error`` bounds the errors of the coefficients a_k in units of rho^k."""
-    return jnp.max(jnp.hypot(*spectrum), axis=0), spectral_radius_bound(*spectrum, error)
+    return over_first(jnp.maximum, jnp.hypot(*spectrum)), spectral_radius_bound(*spectrum, error)
 
 
-def radius_in_closed_form(z: Array, error: Array, scale: Array, tolerance: float) -> Radius:
-    """Spectral radius and bound of ``z`` ``(4, 4, N)``, by eigenvalues only in lanes where the closed form is insufficient.
+def radius_in_closed_form(
+    z: Array, error: Array, scale: Array, undamped: Array, tolerance: float
+) -> tuple[Array, Array, Array]:
+    """Spectral radius and bound of ``z`` ``(4, 4, N)``, and flags of bounded motion without damping.
 
-    The closed form is insufficient if its bound is not tight, exceeds ``tolerance`` rho, or leaves open on which side of 1
-    ``scale`` rho lies.
+    Blocks of lanes with one that is ``undamped``, or in which the bound by discs is not tight, exceeds ``tolerance`` rho, or
+    leaves open on which side of 1 ``scale`` rho lies, have a second pass: more steps of Newton's method, and bounds by
+    circles.
     """
-    lanes = z.shape[-1]
 
-    def closed(given: tuple[Array, Array, Array], _: int) -> tuple[Array, Array, Array]:
-        z, error, scale = given
-        c, split = _coefficients(z, error)
-        rho, bound, unsure = stored(quartic.spectral_radius)(c, split)
-        return rho, bound, ~unsure & (bound <= tolerance * rho) & (jnp.abs(scale * rho - 1) > scale * bound)
+    def closed(given: tuple[Array, Array, Array, Array], _: int) -> tuple[Array, Array, Array]:
+        z, error, scale, undamped = given
+        c, norm = _coefficients(z)
 
-    def repaired(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        """Some more lanes by eigenvalues."""
-        rho, bound, certain = state
-        chosen = jnp.nonzero(~certain, size=min(lanes, _REPAIRED), fill_value=jnp.argmin(certain))[0]
-        found = radius_by_eigenvalues(eigenvalues(z[..., chosen]), error[chosen])
-        return rho.at[chosen].set(found[0]), bound.at[chosen].set(found[1]), certain.at[chosen].set(True)
+        def unfinished(state: tuple[Array, ...]) -> Array:
+            return (state[0] == 0) | ((state[0] == 1) & any_lane(~state[1]))
 
-    start = in_blocks(closed, (z, error, scale), lanes, _BLOCK, in_one_kernel)
-    return jax.lax.while_loop(lambda state: ~jnp.all(state[2]), repaired, start)[:2]
+        def attempt(state: tuple[Array, ...]) -> tuple[Array, ...]:
+            number, certain = state[:2]
+            one, two = quartic.factors(c, jnp.where(number == 0, quartic.NEWTON_STEPS, _MORE_STEPS))
+            errors = stored(_errors)(error, jnp.maximum(one.large, two.large), norm, *c.errors)
+            own = c._replace(errors=errors)
+            rho, by_discs, unsure = stored(quartic.spectral_radius)(own, (one, two))
+
+            def circles() -> tuple[Array, Array]:
+                roots = quartic.roots(one, two)
+                total = (x / rho**k for k, x in enumerate(quartic.unexplained(own, one, two), 1))
+                relative = reduce(jnp.maximum, total) + _ROUNDINGS * quartic.EPS
+                by_circles = stored(spectral_radius_bound)(*roots, relative)
+                on_circle = stored(all_on_the_circle)(*roots, relative, scale)
+                return jnp.where(unsure, by_circles, jnp.fmin(by_circles, by_discs)), undamped & on_circle
+
+            bound, bounded = jax.lax.cond(number == 0, lambda: (by_discs, undamped & False), circles)
+            clear = ~unsure & (bound <= tolerance * rho) & (jnp.abs(scale * rho - 1) > scale * bound) & ~undamped
+            # Lanes do not depend on each other.
+            found = (jnp.where(certain, *pair) for pair in zip(state[2:], (rho, bound, bounded), strict=True))
+            return number + 1, clear, *found
+
+        blank = jnp.zeros_like(error)
+        start = jnp.int32(0), undamped & False, blank, blank, undamped & False
+        return jax.lax.while_loop(unfinished, attempt, start)[2:]  # pyright: ignore[reportReturnType]
+
+    return in_blocks(closed, (z, error, scale, undamped), z.shape[-1], _BLOCK, in_one_kernel)
 
 
-def _coefficients(z: Array, error: Array) -> tuple[quartic.Coefficients, tuple[Any, Any]]:
-    """The coefficients of the characteristic polynomial with their errors, and its factors."""
+def _coefficients(z: Array) -> tuple[quartic.Coefficients, Array]:
+    """The coefficients of the characteristic polynomial, and the norm of ``z``; ``errors`` are what has been added."""
     a = stored(characteristic_coefficients)(z)
+    norm = stored(lambda z: jnp.sqrt(square_sum(z)))(z)
     # Use the determinant of the matrix even if the exact value is known: multipliers that nearly meet move far less with
-    # the matrix than with a single coefficient.
-    c = quartic.Coefficients(-a[0], a[1], -a[2], stored(lambda x: jnp.sqrt(jnp.sqrt(x)))(a[3]), (0.0,) * 4)  # pyright: ignore[reportArgumentType]
-    split = quartic.factors(c)
-    size, norm = jnp.maximum(split[0].large, split[1].large), stored(lambda z: jnp.sqrt(square_sum(z)))(z)
-    return c._replace(errors=stored(_errors)(error, size, norm)), split
+    # the matrix than with a single coefficient. It is positive, but for rounding.
+    d = jnp.maximum(a[3], quartic.EPS * norm**4)
+    kappa = stored(lambda x: jnp.sqrt(jnp.sqrt(x)))(d)
+    return quartic.Coefficients(-a[0], a[1], -a[2], kappa, (d - a[3],)), norm  # pyright: ignore[reportArgumentType]
 
 
-def _errors(error: Array, size: Array, norm: Array) -> tuple[Array, ...]:
+def _errors(error: Array, size: Array, norm: Array, moved: Array) -> tuple[Array, ...]:
     # The recursion for a_k multiplies k matrices.
-    return tuple(error * size**k + _ROUNDINGS * quartic.EPS * norm**k for k in (1, 2, 3, 4))
+    found = [error * size**k + _ROUNDINGS * quartic.EPS * norm**k for k in (1, 2, 3, 4)]
+    return *found[:3], found[3] + moved
 
 
 VARIABLES = (
@@ -163,7 +186,7 @@ def results(
 
     Without damping stable means bounded, and the spectral radius of a stable point is 1.
     ``spectrum``: real and imaginary parts of the eigenvalues of ``z.matrix``, if known. Otherwise the spectral radius of
-    four states comes from the closed form, and from eigenvalues only where the closed form is not accurate enough.
+    four states comes from the closed form.
     """
     wanted = set(outputs)
     finite = jnp.all(jnp.isfinite(z.matrix), axis=(0, 1))
@@ -172,18 +195,19 @@ def results(
     def eigen() -> Spectrum:
         return spectrum or eigenvalues(jnp.where(finite, z.matrix, jnp.nan))
 
+    undamped = finite & model.is_hamiltonian()
     if wanted & MULTIPLIERS:
         spectrum = eigen()
     if spectrum is None and has_closed_form(z.matrix):
-        rho, error = radius_in_closed_form(z.matrix, z.error, size, 10 * rtol)
+        rho, error, bounded = radius_in_closed_form(z.matrix, z.error, size, undamped, 10 * rtol)
     else:
         rho, error = radius_by_eigenvalues(eigen(), z.error)
+        none = jnp.zeros_like(finite)
+        bounded = undamped & jax.lax.cond(
+            jnp.any(undamped), lambda: all_on_the_circle(*eigen(), z.error, size), lambda: none
+        )
     # Compiled, the largest of moduli that are all NaN may be -inf.
     rho, error = (jnp.where(finite, x, jnp.nan) for x in (rho, error))
-    undamped, nowhere = finite & model.is_hamiltonian(), jnp.zeros_like(finite)
-    bounded = jax.lax.cond(
-        jnp.any(undamped), lambda: undamped & all_on_the_circle(*eigen(), z.error, size), lambda: nowhere
-    )
     rho, error = jnp.where(bounded, 1 / size, rho), jnp.where(bounded, _ROUNDING / size, error)
     found: dict[str, Array] = {}
     if spectrum and wanted & MULTIPLIERS:

@@ -136,6 +136,15 @@ def _using_all(closed: Any, certain: Array, values: list[Array]) -> list[Array]:
     return [jnp.where(certain, first, read), *others]
 
 
+def any_lane(flags: Array) -> Array:
+    """True if any of ``flags`` ``(lanes,)`` is, by slices: a reduction cannot be part of a kernel."""
+    while len(flags) > 1:
+        half = len(flags) // 2
+        folded = flags[:half] | flags[half : 2 * half]
+        flags = folded if len(flags) % 2 == 0 else jnp.concatenate([folded[:-1], folded[-1:] | flags[-1:]])
+    return flags[0]
+
+
 def suits_one_kernel(function: Callable[..., Any], *arguments: Any) -> bool:
     """True if all operations of ``function`` on ``arguments`` may be part of a single kernel."""
     return all(name in _KNOWN for name in _operations(jax.make_jaxpr(function)(*arguments).jaxpr))
