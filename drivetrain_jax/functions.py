@@ -8,10 +8,11 @@ contracted with the tangents, so forward and reverse mode both work. A missing d
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from typing import Any
 
 import equinox as eqx
@@ -20,8 +21,9 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.custom_batching import custom_vmap
 
-from drivetrain_jax import _compile_cache
+from drivetrain_jax import _programs
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import did_you_mean
 from drivetrain_jax.analysis import OUTCOME, Analysis, Dimension, Outcome, Request, Solver, analyses_of, get_analysis
@@ -31,8 +33,8 @@ from drivetrain_jax.analysis.request import checked_solvers, dimensions_of, make
 from drivetrain_jax.systems import System
 from drivetrain_jax.systems._base import printed
 
-# Lanes of similar effort that are solved together.
-_TOGETHER = 128
+# Lanes of similar effort that are solved together, and lanes whose program is compiled without optimisation.
+_TOGETHER, _FEW = 128, 128
 
 
 class Result(eqx.Module):
@@ -172,60 +174,118 @@ def _concrete(job: _Job, parameters: Any) -> dict[str, Array]:
 
 @lru_cache(maxsize=64)
 def _compiled(job: _Job, index: int) -> Callable[..., dict[str, Array]]:
-    _compile_cache.enable()
-    solver = job.solvers[index]
+    _programs.enable()
+    return _program(job, partial(_solve, job, index), f"solver {index}", 1)
+
+
+def _program(job: _Job, function: Callable[..., Any], name: str, lanes: int) -> Callable[..., Any]:
+    """``function`` of concrete values of ``lanes`` points, compiled once, and stored on disk for later processes."""
+    solver = job.solvers[0]
+    options = compiler_options(lanes, march=solver.march, short_loops=solver.short_loops)
     # Without optimisation if a call takes milliseconds: a user with many calls compiles them by `jax.jit`.
-    options = compiler_options(1, march=solver.march) if solver.lengthy else options_for_few()
-    return jax.jit(partial(_solve, job, index), compiler_options=options)
+    if lanes <= _FEW and not solver.lengthy:
+        options = options_for_few()
+    request, constants = job.request, [x.tolist() if isinstance(x, np.ndarray) else x for x in job.constants.leaves]
+    content = [name, request.outputs, request.method, dict(request.options), constants, job.path, job.single]
+    return _programs.Program(function, options, _programs.program_identity(job.system, job.analysis, repr(content)))
 
 
 @lru_cache(maxsize=64)
 def _pure(job: _Job) -> Callable[[Any], dict[str, Array]]:
     """The function of the parameters, with its derivatives."""
-    _compile_cache.enable()
-    whole = jax.jit(partial(_solve, job, 0))
+    _programs.enable()
 
     @jax.custom_jvp
     def solve(parameters: Any) -> dict[str, Array]:
-        return whole(parameters)
+        return _apart(job, "values")(parameters)
 
     @solve.defjvp
     def _(primals: tuple[Any], tangents: tuple[Any]) -> tuple[dict[str, Array], dict[str, Any]]:
         (parameters,), (directions,) = primals, tangents
+        if job.analysis.once:
+            parameters = _once(job.analysis.once)(parameters)
         outputs = tuple(dict.fromkeys((*job.request.outputs, *job.analysis.derivative_outputs(job.request.outputs))))
         wider = job if outputs == job.request.outputs else replace(job, request=replace(job.request, outputs=outputs))
-        # A gradient outside of `jax.jit` and `jax.vmap`.
-        single = not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(parameters))
-        results, jacobians = _with_jacobians(wider, single)(parameters)
-        direction = jnp.stack(jax.tree.leaves(directions))
+        results = _pure(wider)(parameters)
+        jacobians = _apart(wider, "derivatives")((parameters, results)) if job.analysis.derivatives else {}
         kept = {name: results[name] for name in (*job.request.outputs, OUTCOME.name)}
-        return kept, {name: _tangent(name, x, jacobians, direction) for name, x in kept.items()}
+        smooth = {name: x for name, x in kept.items() if jnp.issubdtype(x.dtype, jnp.inexact)}
+        none = {name: np.zeros(x.shape, jax.dtypes.float0) for name, x in kept.items()}
+        return kept, none | _tangents(smooth, dict(jacobians), jax.tree.leaves(directions))
 
     return solve
 
 
-@lru_cache(maxsize=64)
-def _with_jacobians(job: _Job, single: bool) -> Callable[[Any], tuple[dict[str, Array], Mapping[str, Array]]]:
-    """The results and their known Jacobians as a function of the parameters, compiled lightly for a ``single`` point."""
+@cache
+def _once(message: str) -> Callable[[Any], Any]:
+    """The identity, whose derivative is an error."""
 
-    def both(parameters: Any) -> tuple[dict[str, Array], Mapping[str, Array]]:
-        results, known = _pure(job)(parameters), job.analysis.derivatives
-        found = known(job.system, job.request, parameters, job.constants, results) if known else {}
-        return results, found
+    @jax.custom_jvp
+    def same(parameters: Any) -> Any:
+        return parameters
 
-    light = single and not any(solver.lengthy for solver in job.solvers)
-    return jax.jit(both, compiler_options=options_for_few() if light else None)
+    @same.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        raise InputError(message)
+
+    return same
 
 
-def _tangent(name: str, result: Array, jacobians: Mapping[str, Array], direction: Array) -> Any:
-    """The tangent of one result: 0 for error estimates, NaN for a result without a derivative."""
-    if not jnp.issubdtype(result.dtype, jnp.inexact):
-        return np.zeros(result.shape, jax.dtypes.float0)
-    if name in jacobians:
-        jacobian = jnp.asarray(jacobians[name], result.dtype).reshape(result.size, direction.size)
-        return _product(jacobian, direction.astype(result.dtype)).reshape(result.shape)
-    unknown = 0.0 if name.endswith(("_error", "_residual")) else jnp.nan
-    return jnp.full(result.shape, unknown, result.dtype) * jnp.sum(direction)
+@lru_cache(maxsize=128)
+def _apart(job: _Job, kind: str, batches: tuple[tuple[int, tuple[bool, ...]], ...] = ()) -> Callable[[Any], Any]:
+    """The ``values``, or the ``derivatives`` of parameters and values, of a point in nested ``batches``.
+
+    For concrete numbers, such as those of an eager ``jax.vmap`` or ``jax.grad``, it is a program of its own; for traced ones
+    it is part of the caller's.
+    """
+
+    def function(given: Any) -> Any:
+        if kind == "values":
+            return _solve(job, 0, given)
+        parameters, results = given
+        return job.analysis.derivatives(job.system, job.request, parameters, job.constants, results)  # pyright: ignore[reportOptionalCall]
+
+    for batch, own in batches:
+        function = partial(_mapped, function, batch, own)
+    inlined, lanes = custom_vmap(jax.jit(function)), math.prod(batch for batch, _ in batches)
+
+    @inlined.def_vmap
+    def _(batch: int, batched: Any, given: Any) -> Any:
+        found = _apart(job, kind, (*batches, (batch, tuple(jax.tree.leaves(batched[0])))))(given)
+        return found, jax.tree.map(lambda _: True, found)
+
+    @cache
+    def program() -> Callable[..., Any]:
+        return _program(job, function, f"{kind} {batches}", lanes)
+
+    def call(given: Any) -> Any:
+        if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(given)):
+            return inlined(given)
+        return _concrete(job, given) if kind == "values" and not batches else program()(given)
+
+    return call
+
+
+def _mapped(function: Callable[[Any], Any], batch: int, own: tuple[bool, ...], given: Any) -> Any:
+    """``function`` of every member of a batch, in which the leaves ``own`` of ``given`` have a first axis."""
+    leaves, tree = jax.tree.flatten(given)
+    axes = [0 if each else None for each in own]
+    return jax.vmap(lambda *x: function(jax.tree.unflatten(tree, x)), axes, axis_size=batch)(*leaves)
+
+
+@jax.jit
+def _tangents(results: dict[str, Array], jacobians: dict[str, Array], directions: list[Array]) -> dict[str, Array]:
+    """The tangent of each result: 0 for error estimates, NaN for a result without a derivative."""
+    direction = jnp.stack(directions)
+
+    def tangent(name: str, result: Array) -> Array:
+        if name in jacobians:
+            jacobian = jnp.asarray(jacobians[name], result.dtype).reshape(result.size, direction.size)
+            return _product(jacobian, direction.astype(result.dtype)).reshape(result.shape)
+        unknown = 0.0 if name.endswith(("_error", "_residual")) else jnp.nan
+        return jnp.full(result.shape, unknown, result.dtype) * jnp.sum(direction)
+
+    return {name: tangent(name, x) for name, x in results.items()}
 
 
 def _product(jacobian: Array, direction: Array) -> Array:

@@ -12,10 +12,10 @@ import numpy as np
 
 import drivetrain_jax
 from drivetrain_jax._machine import machine
+from drivetrain_jax._programs import PACKAGES
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.axes import Grid
-from drivetrain_jax.runs.identity import PACKAGES
 from drivetrain_jax.runs.scene import Problem, Scene, result_variables
 from drivetrain_jax.store.consolidate import release
 from drivetrain_jax.store.files import command, now, versions

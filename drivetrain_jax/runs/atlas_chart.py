@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._programs import program_identity, remembered
 from drivetrain_jax._quantities import Parameter
 from drivetrain_jax._units import factor
 from drivetrain_jax._wording import shown as quoted
@@ -26,8 +27,6 @@ from drivetrain_jax.atlas.tips import Tips, find_tips
 from drivetrain_jax.atlas.windows import narrow
 from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, check_same, open_atlas
 from drivetrain_jax.runs.axes import in_unit
-from drivetrain_jax.runs.identity import program_identity
-from drivetrain_jax.runs.kernel import remembered
 from drivetrain_jax.runs.physical import in_parameters
 from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.store.files import source_digest

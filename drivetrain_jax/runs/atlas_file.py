@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from drivetrain_jax import _compile_cache
+from drivetrain_jax import _programs
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import counted, did_you_mean, shown
 from drivetrain_jax.analysis import OUTCOME, Request, get_analysis
@@ -22,7 +22,6 @@ from drivetrain_jax.atlas.floquet import floquet_domain
 from drivetrain_jax.runs.assemble import ResultBuffer, labelled, result_attrs, to_dataset
 from drivetrain_jax.runs.axes import Axis
 from drivetrain_jax.runs.job import Job
-from drivetrain_jax.runs.kernel import kept
 from drivetrain_jax.runs.physical import in_parameters
 from drivetrain_jax.runs.reuse import ReusedPoints
 from drivetrain_jax.runs.scene import Scene, atlas_ranges, restore_scene
@@ -104,7 +103,7 @@ _ATTRIBUTES = ("scene", "coordinates_of_panels", "tolerance", "solves")
 
 def to_labelled(stability: StabilityAtlas, scene: Scene) -> Labelled:
     """The result of a scene of an atlas: its panels, and a chart that readers without this package show."""
-    stored = StoredAtlas(scene, replace(stability, keep=partial(kept, scene.system)))
+    stored = StoredAtlas(scene, replace(stability, keep=partial(_programs.kept, scene.system)))
     atlas, chart = stability.atlas, _chart(stored)
     arrays = to_arrays(atlas)
     data = {
@@ -153,7 +152,7 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
     >>> print(atlas(Omega=1.1).verdict.item())
     0
     """
-    _compile_cache.enable(short=True)
+    _programs.enable(short=True)
     label = f"file = {str(source)!r}" if isinstance(source, (str, Path)) else "dataset"
     arrays, attrs = _content(source, label)
     if missing := _missing(arrays, attrs):
@@ -170,7 +169,7 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
     used = {name: scene.fixed[name] for name in scene.system.models["atlas"].parameters if name in scene.fixed}
     atlas = from_arrays(arrays, names, domain.coordinates, used, attrs["tolerance"], attrs["solves"])
     stability = stability_atlas(atlas, scene.system, scene.request.options["rtol"])
-    return StoredAtlas(scene, replace(stability, keep=partial(kept, scene.system)))
+    return StoredAtlas(scene, replace(stability, keep=partial(_programs.kept, scene.system)))
 
 
 def _content(source: str | Path | xr.Dataset, label: str) -> tuple[dict[str, np.ndarray], Mapping[str, Any]]:

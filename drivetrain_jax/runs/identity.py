@@ -5,103 +5,22 @@ Only work with the same digest may be resumed.
 
 from __future__ import annotations
 
-import inspect
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._machine import instruction_set
 from drivetrain_jax._wording import clipped, counted
-from drivetrain_jax.analysis import Analysis, Solver
+from drivetrain_jax.analysis import Solver
 from drivetrain_jax.analysis.atlas.analysis import ANALYSIS
 from drivetrain_jax.runs.scene import Problem, Scene, is_of_function, restore_scene
-from drivetrain_jax.store.files import digest, source_digest, versions
-from drivetrain_jax.systems import System
+from drivetrain_jax.store.files import digest
 
 if TYPE_CHECKING:
     from drivetrain_jax.runs.job import Job
-
-PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "numpy", "scipy")
-_ROOT = Path(drivetrain_jax.__file__).parent
-# Folders and files of this package that compute numbers, and the files in these folders that only read results.
-_FOLDERS = ("systems", "analysis", "atlas")
-_ENGINE = ("axes", "job", "kernel", "over", "resolve", "through_atlas")
-_FILES = ("_quantities", "resonances", "store/parts", *(f"runs/{name}" for name in _ENGINE))
-_READER = "figure.py"
-
-
-def numerics_of(system: type[System], analysis: Analysis, route: str) -> dict[str, Any]:
-    """Everything that affects the bits: route, numeric code, package versions, and instruction set.
-
-    The code includes this package, and the packages of the system and of the analysis.
-    """
-    sources = dict(_own_sources())
-    for file in _files(system, analysis):
-        sources |= _sources_of(_package_of(file)) if file else {}
-    return {
-        "route": route,
-        "sources": sources,
-        "versions": versions(PACKAGES),
-        "x64": bool(jax.config.jax_enable_x64),  # pyright: ignore[reportAttributeAccessIssue]
-        "backend": jax.default_backend(),
-        "flags": os.environ.get("XLA_FLAGS", ""),
-        "instructions": " ".join(sorted(instruction_set())),
-    }
-
-
-def program_identity(system: type[System], analysis: Analysis, content: object) -> str:
-    """Digest of everything that affects a program; empty for code outside of this package.
-
-    Such code may depend on more than its files, such as the arguments of a script.
-    """
-    if not all(file and _package_of(file) == _ROOT for file in _files(system, analysis)):
-        return ""
-    return digest([numerics_of(system, analysis, ""), system.name, analysis.name, drivetrain_jax.__version__, content])
-
-
-def _files(system: type[System], analysis: Analysis) -> list[Path | None]:
-    """Files of the code of a system and of an analysis."""
-    found: list[Path | None] = []
-    for function in (analysis.model(system).build, analysis.solvers):
-        # A partial, or a wrapper around a method, has no source of its own.
-        file = inspect.getsourcefile(inspect.unwrap(getattr(function, "func", function)))
-        found.append(Path(file) if file else None)
-    return found
-
-
-# Cached: later edits of the files do not change the imported code.
-@cache
-def _own_sources() -> dict[str, str]:
-    """Digests of the numeric code of this package, by folder or file."""
-    parts = {f"{name}.py": [_ROOT / f"{name}.py"] for name in _FILES}
-    for path in sorted(path for name in _FOLDERS for path in (_ROOT / name).rglob("*.py")):
-        if path.name != _READER:
-            parts.setdefault(path.parent.relative_to(_ROOT).as_posix(), []).append(path)
-    return {part: source_digest({path.name: path for path in paths}) for part, paths in parts.items()}
-
-
-@cache
-def _sources_of(package: Path) -> dict[str, str]:
-    """Digest of a package (a folder or one file) by its name; empty for this package."""
-    if package == _ROOT or not package.exists():
-        return {}
-    files = package.rglob("*.py") if package.is_dir() else [package]
-    return {package.name: source_digest({path.relative_to(package.parent).as_posix(): path for path in files})}
-
-
-def _package_of(path: Path) -> Path:
-    """The outermost package that contains a source file, or the file itself without one."""
-    while (path.parent / "__init__.py").is_file():
-        path = path.parent
-    return path
 
 
 def scene_content(scene: Problem) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from drivetrain_jax import _compile_cache
+from drivetrain_jax import _programs
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax._machine import usable_cores
 from drivetrain_jax._precision import use_double_precision
@@ -22,7 +22,7 @@ from drivetrain_jax._threads import in_double_precision, threads
 from drivetrain_jax.analysis import Solver
 from drivetrain_jax.runs.assemble import dimension_sizes, missing_value
 from drivetrain_jax.runs.axes import Grid
-from drivetrain_jax.runs.identity import numerics_of, scene_digest
+from drivetrain_jax.runs.identity import scene_digest
 from drivetrain_jax.runs.kernel import FEW, LIGHT, Kernel, for_device, kernel_of
 from drivetrain_jax.runs.scene import Problem, Scene, result_variables
 from drivetrain_jax.store.files import digest
@@ -67,7 +67,7 @@ class Job:
         """The solvers that a plan chooses from."""
         # Before the first kernel, which the plan may need.
         _check_double_precision()
-        _compile_cache.enable(short=True)
+        _programs.enable(short=True)
         return tuple(map(for_device, self.problem.solvers))
 
     @property
@@ -93,7 +93,7 @@ class Job:
     @cached_property
     def numerics_detail(self) -> dict[str, Any]:
         """The entries whose digest is ``numerics``."""
-        return numerics_of(self.problem.system, self.problem.analysis, self.route.name)
+        return _programs.numerics_of(self.problem.system, self.problem.analysis, self.route.name)
 
     @property
     def numerics_attrs(self) -> dict[str, str]:

@@ -10,13 +10,12 @@ import jax
 import numpy as np
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._programs import compiled, program_identity
 from drivetrain_jax.analysis import get_analysis
 from drivetrain_jax.analysis.numerics.kernels import options_for_few
 from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.analysis.request import make_request
 from drivetrain_jax.atlas.windows import Crossing
-from drivetrain_jax.runs.identity import program_identity
-from drivetrain_jax.runs.kernel import compiled
 from drivetrain_jax.runs.physical import GivenData, described
 from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.systems import System

@@ -10,7 +10,8 @@ import pytest
 import toy
 
 import drivetrain_jax as dt
-from drivetrain_jax.runs import identity
+from drivetrain_jax import _programs
+from drivetrain_jax.runs.identity import scene_digest
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.store.files import source_digest
@@ -73,7 +74,7 @@ def test_numerics_change_the_digest(monkeypatch):
     before = digest(BASE)
     for name, value in (("instruction_set", lambda: {"z80"}), ("versions", lambda packages: {"jax": "9"})):
         with monkeypatch.context() as patch:
-            patch.setattr(identity, name, value)
+            patch.setattr(_programs, name, value)
             assert digest(BASE) != before
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
     assert digest(BASE) != before
@@ -93,12 +94,12 @@ def test_the_code_of_systems_analyses_and_engine_changes_the_digest():
 
 def test_a_changed_file_changes_the_digest_and_a_figure_does_not(monkeypatch, tmp_path):
     def digests():
-        identity._own_sources.cache_clear()
-        return identity._own_sources()
+        _programs._own_sources.cache_clear()
+        return _programs._own_sources()
 
     copy = tmp_path / "drivetrain_jax"
     shutil.copytree(Path(dt.__file__).parent, copy, ignore=shutil.ignore_patterns("__pycache__", "sweeps"))
-    monkeypatch.setattr(identity, "_ROOT", copy)
+    monkeypatch.setattr(_programs, "_ROOT", copy)
     before = digests()
     try:
         (copy / "analysis" / "floquet" / "figure.py").write_text("")
@@ -106,7 +107,7 @@ def test_a_changed_file_changes_the_digest_and_a_figure_does_not(monkeypatch, tm
         (copy / "analysis" / "floquet" / "direct.py").write_text("")
         changed = digests()
     finally:
-        identity._own_sources.cache_clear()
+        _programs._own_sources.cache_clear()
     assert {name for name in before if changed[name] != before[name]} == {"analysis/floquet"}
 
 
@@ -115,12 +116,12 @@ def test_the_whole_package_of_an_external_system_changes_the_digest(tmp_path):
     (package / "laws").mkdir(parents=True)
     for name in ("__init__.py", "shaft.py", "laws/__init__.py", "laws/stiffness.py"):
         (package / name).write_text("")
-    assert identity._package_of(package / "laws" / "stiffness.py") == package
-    before = identity._sources_of(package)
+    assert _programs._package_of(package / "laws" / "stiffness.py") == package
+    before = _programs._sources_of(package)
     assert list(before) == ["gears"]
     (package / "laws" / "stiffness.py").write_text("K = 1")
-    identity._sources_of.cache_clear()
-    assert identity._sources_of(package) != before
+    _programs._sources_of.cache_clear()
+    assert _programs._sources_of(package) != before
 
 
 def test_the_route_changes_the_digest():
@@ -138,4 +139,4 @@ def test_chunk_size_changes_the_digest(monkeypatch):
     scene = load_scene(BASE)
     engine = resolve(scene)
     solvers = [replace(solver, chunk=solver.chunk * 2) for solver in engine.solvers]
-    assert identity.scene_digest(scene, solvers, engine.numerics) != engine.digest
+    assert scene_digest(scene, solvers, engine.numerics) != engine.digest

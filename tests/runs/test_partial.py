@@ -88,8 +88,8 @@ def test_work_of_another_version_is_not_opened(grid_scene, tmp_path, monkeypatch
     path = tmp_path / "r.nc"
     with pytest.raises(Interrupted):
         run_to_file(grid_scene, path, executor=Threads(1), report=stop_after(2))
-    from drivetrain_jax.runs import identity
+    from drivetrain_jax import _programs
 
-    monkeypatch.setattr(identity, "versions", lambda names: dict.fromkeys(names, "0"))
+    monkeypatch.setattr(_programs, "versions", lambda names: dict.fromkeys(names, "0"))
     with pytest.raises(dt.InputError, match="unfinished work of another scene or version: diffrax is 0"):
         dt.open_result(path)

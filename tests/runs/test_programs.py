@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from drivetrain_jax.runs.identity import program_identity
+from drivetrain_jax._programs import program_identity
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems.planetary import Planetary
 
@@ -26,13 +26,13 @@ print(compiled.count("/jax/core/compile/backend_compile_duration"))
 """
 CALLBACK = """
 import jax, jax.numpy as jnp, numpy as np
-from drivetrain_jax import _compile_cache
+from drivetrain_jax import _programs
 from drivetrain_jax.runs import kernel
-_compile_cache.enable(short=True)
+_programs.enable(short=True)
 def called(x):
     return jax.pure_callback(lambda v: np.asarray(v) + 1, jax.ShapeDtypeStruct((3,), x.dtype), x)
 kinds = (jax.ShapeDtypeStruct((3,), np.float64),)
-print(programs.compiled(called, kinds, {}, "name")(jnp.zeros(3)))
+print(_programs.compiled(called, kinds, {}, "name")(jnp.zeros(3)))
 """
 
 

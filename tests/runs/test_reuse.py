@@ -300,9 +300,9 @@ def test_results_that_differ_in_more_than_points_are_refused(tmp_path, change, r
 
 def test_other_numerics_are_refused(tmp_path, monkeypatch):
     run_to_file(SMALL, tmp_path / "r.nc")
-    from drivetrain_jax.runs import identity
+    from drivetrain_jax import _programs
 
-    monkeypatch.setattr(identity, "versions", lambda names: dict.fromkeys(names, "0"))
+    monkeypatch.setattr(_programs, "versions", lambda names: dict.fromkeys(names, "0"))
     with pytest.raises(InputError, match=r"another scene or version: axes.a has 161 .*; diffrax is 0, was"):
         run_to_file(LARGE, tmp_path / "r.nc")
     with pytest.raises(InputError, match="diffrax is 0, was"):

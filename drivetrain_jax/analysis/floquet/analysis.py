@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter
 from drivetrain_jax.analysis._base import DIFFRAX_SOLVERS, RTOL, Analysis, Request, Solver
 from drivetrain_jax.analysis.floquet.direct_solvers import direct_solvers
@@ -54,18 +53,6 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
 _DERIVATIVES = 1e-13
 
 
-@jax.custom_jvp
-def _once(parameters: Any) -> Any:
-    """``parameters``, whose second differentiation raises an error."""
-    return parameters
-
-
-@_once.defjvp
-def _(primals: Any, tangents: Any) -> Any:
-    del primals, tangents
-    raise InputError("floquet: got a second derivative, expected a first; take differences of the gradient")
-
-
 def _derivatives(
     system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
 ) -> dict[str, Array]:
@@ -76,7 +63,7 @@ def _derivatives(
     del results
     from drivetrain_jax.analysis.floquet.derivatives import monodromy, multipliers, shares_modulus
 
-    parameters, build = _once(parameters), system.models["floquet"].build
+    build = system.models["floquet"].build
     panels = traced_panels(build, eqx.combine(parameters, constants.tree), _DERIVATIVES)
     z, log_scale, pull = monodromy(build, parameters, constants, panels)
     sigma, by_entry, error = multipliers(z)
@@ -132,4 +119,5 @@ ANALYSIS = Analysis(
     lacks=_lacks,
     undecided="the spectral radius is 1 within its error: a smaller rtol than {rtol:g} may decide",
     derivatives=_derivatives,
+    once="floquet: got a second derivative, expected a first; take differences of the gradient",
 )

@@ -115,8 +115,8 @@ def spectral_radius_bound(real: Array, imaginary: Array, error: Array) -> Array:
     return rho * (over_first(jnp.maximum, radii) + 4 * np.finfo(float).eps)
 
 
-def _diagonal(n: int, axes: int) -> np.ndarray:
-    return np.eye(n, dtype=bool).reshape(n, n, *(1,) * axes)
+def _diagonal(n: int, axes: int) -> Array:
+    return jnp.eye(n, dtype=bool).reshape(n, n, *(1,) * axes)
 
 
 def _smallest_radii(certified: Callable[[Array, Array], Array], like: Array, n: int, error: Array) -> Array:

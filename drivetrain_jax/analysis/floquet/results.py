@@ -76,7 +76,7 @@ def radius_in_closed_form(
         def attempt(state: tuple[Array, ...]) -> tuple[Array, ...]:
             number, certain = state[:2]
             one, two = quartic.factors(c, jnp.where(number == 0, quartic.NEWTON_STEPS, _MORE_STEPS))
-            errors = stored(_errors)(error, jnp.maximum(one.large, two.large), norm, *c.errors)
+            errors = stored(_errors)(error, jnp.maximum(one.large, two.large), norm, c.errors[0])
             own = c._replace(errors=errors)
             rho, by_discs, unsure = stored(quartic.spectral_radius)(own, (one, two))
 

@@ -97,8 +97,8 @@ class Constants:
 
     def __init__(self, tree: Any) -> None:
         self.tree = tree
-        leaves, structure = jax.tree.flatten(tree)
-        content = [(x.shape, x.tobytes()) if isinstance(x, np.ndarray) else x for x in leaves]
+        self.leaves, structure = jax.tree.flatten(tree)
+        content = [(x.shape, x.tobytes()) if isinstance(x, np.ndarray) else x for x in self.leaves]
         self._content = (*content, structure)
 
     def __eq__(self, other: object) -> bool:
