@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -12,7 +14,7 @@ from drivetrain_jax import view
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import shown
 from drivetrain_jax.datasets.resonances import LABELS, resonances
-from drivetrain_jax.view.units import check_shown, in_given_units, in_units, listed, size
+from drivetrain_jax.view.units import check_measured, in_given_units, in_units, listed, size
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -62,18 +64,18 @@ def plot(
     datasets = [_dataset(source) for source in sources]
     kinds = [dataset.attrs.get("analysis") for dataset in datasets]
     if kinds == ["atlas"]:
-        return _drawn([_chart(sources[0], datasets[0], part, cells)], asked)
+        return drawn([_chart(sources[0], datasets[0], part, cells)], asked)
     if part is not None or cells is not None:
         field = f"part = {shown(part)}" if part is not None else f"cells = {cells}"
         raise InputError(f"{field}: a result on a grid is drawn whole; allowed for an atlas")
     if kinds == ["floquet", "atlas"]:
         from drivetrain_jax.runs.atlas_chart import with_boundaries
 
-        return _drawn([with_boundaries(_loaded(datasets[0]), _place(sources[1], datasets[1]))], asked)
+        return drawn([with_boundaries(_loaded(datasets[0]), _place(sources[1], datasets[1]))], asked)
     if "atlas" in kinds:
         raise InputError("results: an atlas among several; allowed is an atlas alone, or a chart and its atlas")
     try:
-        return _drawn([_loaded(dataset) for dataset in datasets], asked)
+        return drawn([_loaded(dataset) for dataset in datasets], asked)
     except (KeyError, IndexError) as error:
         if any(isinstance(source, (str, Path)) for source in sources):
             raise
@@ -87,25 +89,38 @@ def lacks(error: Exception, why: str) -> InputError:
 
 
 def table(path: Path, units: str | None, separator: str = "") -> str:
-    """The constants of a single point as a table of text; raises :class:`InputError` for any other result."""
+    """The constants of a single point as text: aligned under title and parameters, or ``name,value,units`` with a separator.
+
+    Raises :class:`InputError` for a result over an axis, and of another analysis.
+    """
     dataset = _loaded(_dataset(path))
     if dataset.attrs.get("analysis") != "parameters":
         raise InputError(f"file = {str(path)!r}: has a figure; allowed is a name that ends in .png, .pdf, .svg")
-    from drivetrain_jax.analysis.parameters.figure import table as written
+    from drivetrain_jax.view import charts
+    from drivetrain_jax.view.sheet import shown_title
+    from drivetrain_jax.view.style import caption
 
-    return written(in_units(in_given_units(dataset), [] if units is None else listed(units)), separator)
+    dataset = charts.prepare(in_units(in_given_units(dataset), [] if units is None else listed(units)))
+    if charts.sweep_axes(dataset) or not charts.results(dataset):
+        raise charts.wrong_axes(dataset, "none for a table; a figure ends in .png, .pdf, .svg")
+    rows = charts.table_rows(dataset, ".17g" if separator else ".6g")
+    if separator:
+        text = io.StringIO()
+        csv.writer(text, delimiter=separator, lineterminator="\n").writerows([("name", "value", "units"), *rows])
+        return text.getvalue()
+    widths = [max(len(row[k]) for row in rows) for k in (0, 1)]
+    head = [shown_title(dataset), re.sub(r"[$\\{}]|mathrm", "", caption(dataset)), ""]
+    return "\n".join([*head, *(f"{n:<{widths[0]}}  {v:>{widths[1]}}  {u}".rstrip() for n, v, u in rows), ""])
 
 
-def _drawn(datasets: list[xr.Dataset], asked: list[str]) -> Figure:
-    """The figure of ``datasets``; :class:`InputError` for a unit ``asked`` for that no axis has."""
-    figure = drawn(datasets, asked)
-    check_shown(figure, asked)
-    return figure
+def drawn(datasets: list[xr.Dataset], asked: list[str], check: bool = True) -> Figure:
+    """The figure of ``datasets``, with axes in the units ``asked`` for that fit, else in those of the scene.
 
-
-def drawn(datasets: list[xr.Dataset], asked: list[str]) -> Figure:
-    """The figure of ``datasets``, with axes in the units ``asked`` for that fit, else in those of the scene."""
+    ``check`` raises :class:`InputError` for a unit that measures nothing in the first dataset.
+    """
     datasets = [_with_resonances(in_physical_data(each, asked) if asked else each) for each in datasets]
+    if check:
+        check_measured(datasets[0], asked)
     return view.plot(*(in_units(in_given_units(each), asked) for each in datasets))
 
 

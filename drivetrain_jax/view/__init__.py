@@ -6,9 +6,10 @@ a function from a Dataset to a Figure.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._plugins import FIGURES, call_plugin, load_plugin, plugin_names
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-# Analyses with a figure, analysis/NAME/figure.py.
+# Analyses with a figure of their own, analysis/NAME/figure.py.
 _DRAWN = tuple(sorted(path.parent.name for path in Path(__file__).parents[1].glob("analysis/*/figure.py")))
 # Analyses whose results may share a figure.
 _OVERLAYS = ("frequency_response",)
@@ -28,17 +29,17 @@ __all__ = ["plot"]
 def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     """The figure of the analysis of ``dataset`` (attribute ``analysis``), for example a stability chart.
 
-    ``others`` are results of the same analysis by other methods, drawn into the same axes (``frequency_response``). Axes of
-    one value count as fixed. Save the figure with ``figure.savefig(path)``. Raises :class:`InputError` for an analysis
-    without a figure, for a result without values to plot, and for results that cannot share a figure.
+    A result of another function has lines, maps or a table of its variables. ``others`` are results of the same analysis by
+    other methods, drawn into the same axes (``frequency_response``). Axes of one value count as fixed. Save the figure with
+    ``figure.savefig(path)``. Raises :class:`InputError` for a dataset that is no result, for a result without values to
+    plot, and for results that cannot share a figure.
     """
-    analysis = dataset.attrs.get("analysis")
+    analysis = str(dataset.attrs.get("analysis"))
     if analysis == "atlas":
         drawn = "what its `grid` and `drivetrain plot` make of it"
         raise InputError(f"analysis = 'atlas': is a function; allowed is {drawn}")
-    if analysis not in _DRAWN:
-        return _plot_of_plugin(str(analysis), dataset, *others)
-    if others and analysis not in _OVERLAYS:
+    plugin = None if analysis in _DRAWN else _plugin(analysis)
+    if others and plugin is None and analysis not in _OVERLAYS:
         raise InputError(f"analysis = {analysis!r}: several results in one figure; allowed for {', '.join(_OVERLAYS)}")
     for other in others:
         if other.attrs.get("analysis") != analysis:
@@ -46,26 +47,29 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
                 f"analysis = {other.attrs.get('analysis')!r}: allowed is the analysis of the first result, {analysis}"
             )
     # Local imports: matplotlib takes long, and results without a figure need none.
-    import matplotlib
-
-    from drivetrain_jax.view.charts import prepare
-    from drivetrain_jax.view.style import STYLE
-
-    module = import_module(f"drivetrain_jax.analysis.{analysis}.figure")
-    with matplotlib.rc_context(STYLE):
-        return module.plot(*(prepare(each) for each in (dataset, *others)))
-
-
-def _plot_of_plugin(analysis: str, dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
-    """The figure that another package registered for ``analysis``."""
-    try:
-        found = load_plugin(FIGURES, analysis, "a function")
-    except ImportError as error:
-        raise InputError(f"analysis = {analysis!r}: {' '.join(str(error).split())}") from error
-    if found is None:
-        known = ", ".join((*_DRAWN, *plugin_names(FIGURES)))
-        raise InputError(f"analysis = {analysis!r}: has no figure; allowed is one of {known}")
+    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    allowed = "a matplotlib Figure"
-    return call_plugin(FIGURES, analysis, "figure", found, dataset, *others, kind=Figure, allowed=allowed)
+    if plugin is not None:
+        allowed = "a matplotlib Figure"
+        return call_plugin(FIGURES, analysis, "figure", plugin, dataset, *others, kind=Figure, allowed=allowed)
+    if analysis not in _DRAWN and "outcome" not in dataset:
+        known = ", ".join((*_DRAWN, *plugin_names(FIGURES)))
+        raise InputError(f"analysis = {analysis!r}: has no figure; allowed is one of {known}")
+
+    from drivetrain_jax.view.charts import chart, prepare
+    from drivetrain_jax.view.style import STYLE
+
+    with rc_context(STYLE):
+        if analysis not in _DRAWN:
+            return chart(prepare(dataset))
+        module = import_module(f"drivetrain_jax.analysis.{analysis}.figure")
+        return module.plot(*map(prepare, (dataset, *others)))
+
+
+def _plugin(analysis: str) -> Callable[..., Any] | None:
+    """The function of another package that draws ``analysis``, or None."""
+    try:
+        return load_plugin(FIGURES, analysis, "a function")
+    except ImportError as error:
+        raise InputError(f"analysis = {analysis!r}: {' '.join(str(error).split())}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -12,8 +13,9 @@ import matplotlib
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, QuadMesh
-from matplotlib.colors import LinearSegmentedColormap, ListedColormap, LogNorm, Normalize, SymLogNorm
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import LinearSegmentedColormap, ListedColormap, LogNorm, Normalize, SymLogNorm, to_rgba_array
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
@@ -21,7 +23,7 @@ from matplotlib.ticker import MaxNLocator
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import overlays
-from drivetrain_jax.view.sheet import Sheet, cell_edges, fit_axis, is_logarithmic, plain_decades
+from drivetrain_jax.view.sheet import Sheet, cell_edges, fit_axis, is_logarithmic, plain_decades, widen
 from drivetrain_jax.view.style import (
     FAILED_COLOUR,
     FLAG_COLOURS,
@@ -30,7 +32,9 @@ from drivetrain_jax.view.style import (
     PENDING_COLOUR,
     PREDICTION,
     axis_label,
+    coordinate_text,
     in_brackets,
+    power_of_ten,
     scene_key,
     symbol,
     units_of,
@@ -39,10 +43,20 @@ from drivetrain_jax.view.style import (
 from drivetrain_jax.view.units import size, suitable, value_in, with_prefixes
 
 FAILED, PENDING = "failed", "pending"
+# The flag of points that have a value, where nothing else is known about them.
+_COMPUTED = "computed"
 LIMIT: dict[str, Any] = {"color": FRAME_GREY, "linewidth": 0.8, "linestyle": (0, (2, 2))}
 _NO_PARAMETERS = ("point", PENDING)
 # Flags that always have their number of points in the legend, and the most points of which all flags have it.
 _ALARMING, _COUNTED = ("undecided", FAILED, PENDING), 1000
+# Part of a flag's colour in bands behind lines; the rest is white.
+_PALE = 0.35
+# Most panels of lines; most values of a further axis that all have a map; most entries of a dimension in a table.
+_MOST_PANELS, _FEW_MAPS, _MOST_ENTRIES = 8, 4, 24
+# Line spacing of a table in inches.
+_ROW = 0.24
+# Least range of a vertical axis relative to its values.
+_LEAST_RANGE = 0.01
 # Ratio of the largest to the smallest positive value above which a colour scale is logarithmic.
 _WIDE = 3.0
 # Line styles of variables that share a panel, and number of points below which lines have markers.
@@ -129,25 +143,25 @@ def role(dataset: xr.Dataset, name: str) -> str:
 
 
 def horizontal_first(dataset: xr.Dataset, names: Sequence[str]) -> list[str]:
-    """``names`` with the horizontal axis first: one with predicted resonances, else the speed, else the last one."""
-    speed = role(dataset, "speed")
-    usual = speed if speed in names else names[-1]
-    horizontal = next((name for name in names if f"resonance_{name}" in dataset.coords), usual)
+    """``names`` with the horizontal axis first: the speed, else one with predicted resonances, else the last one."""
+    ranks = [name == role(dataset, "speed") or (f"resonance_{name}" in dataset.coords) / 2 for name in names]
+    horizontal = names[-1] if not any(ranks) else names[int(np.argmax(ranks))]
     return [horizontal, *(name for name in names if name != horizontal)]
 
 
-def along_points(dataset: xr.Dataset) -> xr.Dataset:
-    """A list of points as a result over the first parameter that varies; raises :class:`InputError` if none does."""
-    varying = varying_parameters(dataset)
+def varying_parameters(dataset: xr.Dataset) -> list[str]:
+    """Parameters with several values in a list of points; raises :class:`InputError` without one."""
+    own = {str(name): c for name, c in dataset.coords.items() if c.dims == ("point",) and name not in _NO_PARAMETERS}
+    varying = [name for name, values in own.items() if np.unique(values).size > 1]
     if not varying:
         raise InputError("points: all points are the same, there is nothing to plot; give points that differ")
-    return dataset.swap_dims(point=varying[0]).sortby(varying[0])
+    return varying
 
 
-def varying_parameters(dataset: xr.Dataset) -> list[str]:
-    """Parameters with several values in a list of points."""
-    own = {str(name): c for name, c in dataset.coords.items() if c.dims == ("point",) and name not in _NO_PARAMETERS}
-    return [name for name, values in own.items() if np.unique(values).size > 1]
+def along_points(dataset: xr.Dataset) -> xr.Dataset:
+    """A list of points as a result over the first parameter that varies."""
+    first, *_ = varying_parameters(dataset)
+    return dataset.swap_dims(point=first).sortby(first)
 
 
 def valid(dataset: xr.Dataset, name: str) -> xr.DataArray:
@@ -165,51 +179,34 @@ def _flags(variable: xr.DataArray) -> list[str]:
     return str(variable.attrs.get("flag_meanings", "")).split()
 
 
-def flag_scale(variable: xr.DataArray) -> dict[str, Any]:
-    """The colours of a variable of :func:`valid` with flags."""
-    colours = [*(FLAG_COLOURS.get(flag, FRAME_GREY) for flag in _flags(variable)), FAILED_COLOUR, PENDING_COLOUR]
+def flag_scale(variable: xr.DataArray, strength: float = 1.0) -> dict[str, Any]:
+    """The colours of a variable of :func:`valid` with flags; a ``strength`` below 1 mixes them with white."""
+    names = [FLAG_COLOURS.get(flag, FRAME_GREY) for flag in _flags(variable)]
+    colours = to_rgba_array([*names, FAILED_COLOUR, PENDING_COLOUR])
+    colours[:, :3] = 1 - strength * (1 - colours[:, :3])
     return {"cmap": ListedColormap(colours), "vmin": -0.5, "vmax": len(colours) - 0.5}
 
 
-def flag_entries(variable: xr.DataArray) -> list[Patch]:
+def flag_entries(variable: xr.DataArray, strength: float = 1.0) -> list[Patch]:
     """Legend entries of the flags that occur in a variable of :func:`valid`; with their numbers of points, unless these are
     many."""
     names = [*_flags(variable), FAILED, PENDING]
     counts = np.bincount(variable.values.astype(int).ravel(), minlength=len(names))
-    colours = flag_scale(variable)["cmap"].colors
+    colours = flag_scale(variable, strength)["cmap"].colors
     notes = [
-        f" ({n})" if variable.size <= _COUNTED or name in _ALARMING else ""
-        for name, n in zip(names, counts, strict=True)
+        f" ({n})" * (variable.size <= _COUNTED or name in _ALARMING) for name, n in zip(names, counts, strict=True)
     ]
-    kinds = zip(names, colours, notes, counts, strict=True)
-    return [_patch(name, colour, note) for name, colour, note, n in kinds if n]
+    return [
+        Patch(facecolor=colour, edgecolor=FRAME_GREY, linewidth=0.6, label=name.replace("_", " ") + note)
+        for name, colour, note, n in zip(names, colours, notes, counts, strict=True)
+        if n and name != _COMPUTED
+    ]
 
 
-def failure_entries(dataset: xr.Dataset) -> list[Patch]:
-    """Legend entries of points without a value: failed or pending."""
-    waiting = int(dataset[PENDING].sum()) if PENDING in dataset.coords else 0
-    counts = {FAILED: (FAILED_COLOUR, int(_failures(dataset).sum())), PENDING: (PENDING_COLOUR, waiting)}
-    return [_patch(name, colour, f" ({count})") for name, (colour, count) in counts.items() if count]
-
-
-def _patch(name: str, colour: str, note: str) -> Patch:
-    return Patch(facecolor=colour, edgecolor=FRAME_GREY, linewidth=0.6, label=name.replace("_", " ") + note)
-
-
-def _failures(dataset: xr.Dataset) -> xr.DataArray:
-    """True where a finished point has no value."""
-    failed = dataset["outcome"] >= FIRST_FAILURE
-    return failed & ~dataset[PENDING] if PENDING in dataset.coords else failed
-
-
-def draw_failures(axes: Axes, dataset: xr.Dataset, name: str) -> list[Line2D]:
-    """Draw crosses at the foot of ``axes`` for failed points along the axis ``name``; returns a legend entry."""
-    x = dataset[name].values[_failures(dataset).values]
-    if not x.size:
-        return []
-    style: dict[str, Any] = {"linestyle": "", "marker": "x", "markersize": 3.5, "clip_on": False, "zorder": 5}
-    style |= {"color": FAILED_COLOUR, "label": f"{FAILED} ({x.size})", "transform": axes.get_xaxis_transform()}
-    return axes.plot(x, np.zeros(x.size), **style)
+def computed(dataset: xr.Dataset) -> xr.DataArray:
+    """A variable of :func:`valid` that has only the flags of points without a value: failed or pending."""
+    flag = xr.zeros_like(dataset["outcome"], dtype=int).assign_attrs(flag_meanings=_COMPUTED)
+    return valid(dataset.assign({_COMPUTED: flag}), _COMPUTED)
 
 
 def draw_cells(axes: Axes, field: xr.DataArray, horizontal: str, vertical: str, **options: Any) -> QuadMesh:
@@ -226,17 +223,18 @@ def draw_cells(axes: Axes, field: xr.DataArray, horizontal: str, vertical: str, 
     return mesh
 
 
-def draw_strip(axes: Axes, codes: xr.DataArray, name: str, heights: tuple[float, float], **options: Any) -> list[Patch]:
-    """Draw flags of :func:`valid` along the axis ``name`` between two heights, in fractions of the panel; returns their
-    legend entries."""
-    codes = codes.sortby(name)
-    place = {"transform": axes.get_xaxis_transform(), "clip_on": False, "rasterized": True}
-    x = cell_edges(codes[name].values.astype(float))
-    axes.pcolormesh(x, heights, codes.values[None, :], **flag_scale(codes), **place, **options)
-    entries = flag_entries(codes)
-    for entry in entries:
-        entry.set_alpha(options.get("alpha"))
-    return entries
+def draw_flags(axes: Axes, codes: xr.DataArray, name: str, heights: tuple[float, float] = (0.0, 1.0)) -> list[Patch]:
+    """Draw flags of :func:`valid` as bands along the axis ``name`` between two heights, in fractions of the panel; returns
+    their legend entries.
+
+    Bands within the panel are pale, and at least as wide as a line.
+    """
+    codes, strength = codes.sortby(name), _PALE if heights[0] < 1 else 1.0
+    x, inside = cell_edges(codes[name].values.astype(float)), {"edgecolors": "face", "linewidth": 0.6, "zorder": -2}
+    style: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "clip_on": heights[0] < 1, "rasterized": True}
+    style |= flag_scale(codes, strength) | (inside if heights[0] < 1 else {})
+    axes.pcolormesh(x, heights, codes.values[None, :], **style)
+    return flag_entries(codes, strength)
 
 
 class Growth(NamedTuple):
@@ -296,51 +294,190 @@ def shades(values: np.ndarray) -> dict[str, Any]:
     return {"cmap": matplotlib.colormaps["cividis_r"].with_extremes(bad=FAILED_COLOUR), "norm": norm}
 
 
+def chart(
+    dataset: xr.Dataset,
+    panels: Sequence[Sequence[str]] = (),
+    fields: Sequence[str] = (),
+    *,
+    forced: bool = False,
+    **look: Any,
+) -> Figure:
+    """The figure of any result: a table or lines of a single point, lines over one axis, maps over two, small multiples over
+    more.
+
+    ``panels`` lists the variables of each panel of lines, ``fields`` those of maps; default: all results. ``forced`` draws
+    only those predicted resonances that the forcing excites. ``look`` goes to :func:`draw_lines`.
+    """
+    names, every = sweep_axes(dataset), [[name] for name in results(dataset)]
+    wanted = panels if len(names) < 2 else [[name] for name in fields or [key for panel in panels for key in panel]]
+    stored = [keys for panel in wanted or every if (keys := [key for key in panel if key in dataset])]
+    if not stored:
+        require_any(dataset, *(key for panel in wanted or [["a result"]] for key in panel))
+    if names == ["point"]:
+        if len(varying_parameters(dataset)) > 1 and _flagged(dataset):
+            return _scatter(dataset)
+        dataset, look = along_points(dataset), {"marker": "o", "markersize": 3} | look
+        names = sweep_axes(dataset)
+    if len(names) > 1:
+        return _small_multiples(dataset, [key for keys in stored for key in keys], forced)
+    long = [str(d) for (key, *_) in stored for d in dataset[key].dims if dataset.sizes[d] > _MOST_ENTRIES]
+    if not names and not long:
+        return _table(dataset)
+    along = (names or long)[0]
+    shown = [keys for keys in stored if all(along in dataset[key].dims for key in keys)][:_MOST_PANELS]
+    left_out = f"{len(shown)} of {len(stored)} results shown" if len(shown) < len(stored) else ""
+    return stack(dataset, along, shown, forced=forced, **look).finish(dataset, left_out)
+
+
+def results(dataset: xr.Dataset) -> list[str]:
+    """Names of the numbers in a result, without outcomes and errors."""
+    return [
+        str(name)
+        for name, variable in dataset.data_vars.items()
+        if name != "outcome" and variable.dtype.kind in "fiub" and not str(name).endswith("_error")
+    ]
+
+
+def _flagged(dataset: xr.Dataset) -> str:
+    """The variable whose flags say what happens at a point, or an empty string."""
+    return next((name for name in ("verdict", "regime") if name in dataset), "")
+
+
+def _table(dataset: xr.Dataset) -> Figure:
+    """The values of a single point."""
+    rows = table_rows(dataset)
+    sheet = Sheet(height=_ROW * len(rows))
+    axes = sheet.axes[0, 0]
+    axes.axis("off")
+    axes.set(xlim=(0, 1), ylim=(len(rows) - 0.5, -0.5))
+    for k, (label, number, unit) in enumerate(rows):
+        axes.text(0, k, label, va="center")
+        axes.text(0.72, k, power_of_ten(number), va="center", ha="right")
+        axes.text(0.74, k, unit, va="center", color=FRAME_GREY)
+    return sheet.finish(dataset)
+
+
+def table_rows(dataset: xr.Dataset, digits: str = ".6g") -> list[tuple[str, str, str]]:
+    """Name, value and unit of every result of a single point, one row for each entry of its own dimension."""
+    rows = []
+    for name in results(dataset):
+        variable, units = dataset[name], units_of(dataset[name])
+        label, flags = str(variable.attrs.get("long_name", name)), _flags(variable)
+        for place in np.ndindex(variable.shape):
+            entry = variable[place]
+            own = [
+                f", {dim} {entry[dim].item() if dim in entry.coords else k}"
+                for dim, k in zip(variable.dims, place, strict=True)
+            ]
+            value = flags[int(entry)].replace("_", " ") if flags else f"{entry.item():{digits}}"
+            rows.append((label + "".join(own), value, "" if units == "1" else units))
+    return rows
+
+
+def _scatter(dataset: xr.Dataset) -> Figure:
+    """Points over the first parameters that vary, with the colours and markers of their flags."""
+    horizontal, vertical, *_ = horizontal_first(dataset, varying_parameters(dataset))
+    codes, sheet = valid(dataset, _flagged(dataset)), Sheet(height=3.4)
+    markers = dict(zip([*_flags(codes), FAILED, PENDING], [*"ooD^s"[: len(_flags(codes))], "x", "."], strict=True))
+    numbers = np.unique(codes.values).astype(int)
+    for entry, number in zip(flag_entries(codes), numbers, strict=True):
+        marker, chosen = list(markers.values())[number], dataset.isel(point=codes.values == number)
+        look: dict[str, Any] = {"s": 22, "marker": marker, "label": entry.get_label(), "color": entry.get_facecolor()}
+        look |= {"edgecolors": FRAME_GREY, "linewidths": 0.8} if marker not in "x." else {}
+        sheet.add(sheet.axes[0, 0].scatter(chosen[horizontal], chosen[vertical], **look))
+    sheet.label(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
+    return sheet.finish(dataset)
+
+
+def _small_multiples(dataset: xr.Dataset, fields: Sequence[str], forced: bool) -> Figure:
+    """Maps over the speed and the longest other axis; columns and rows for the values of further axes.
+
+    Of an axis with many values the first, middle and last are shown; with two further axes only the first of ``fields``.
+    """
+    names = sweep_axes(dataset)
+    long = [name for name in names if dataset.sizes[name] > _FEW_MAPS]
+    horizontal = horizontal_first(dataset, long if len(long) > 1 else names)[0]
+    vertical = max((name for name in names if name != horizontal), key=lambda name: dataset.sizes[name])
+    further = [name for name in names if name not in (horizontal, vertical)]
+    # Only the first row has labels of the resonances, so an axis that changes their positions runs across.
+    dependent = dataset.coords.get(f"resonance_{horizontal}", xr.DataArray(0)).dims
+    further.sort(key=lambda name: name not in dependent)
+    total = math.prod(dataset.sizes[name] for name in further)
+    dataset = dataset.isel({name: dataset.sizes[name] // 2 for name in further[2:]})
+    across, down = (_slices(dataset, name) for name in [*further, "", ""][:2])
+    parts = [[part.isel(column) for column in across] for part in (dataset.isel(row) for row in down)]
+    if len(further) > 1:
+        rows = [(fields[0], row) for row in parts]
+    else:
+        rows = [row for key in fields for row in split(parts[0], key)]
+    titled = [*further[:2], *dict.fromkeys(own_dimension(dataset, key) for key in fields)]
+    sheet = maps(rows, (horizontal, vertical), height=1.8 if len(parts) > 1 else 2.5, titled=titled, forced=forced)
+    drawn = len(across) * len(down)
+    return sheet.finish(dataset, f"{drawn} of {total} charts shown" if drawn < total else "")
+
+
+def _slices(dataset: xr.Dataset, name: str) -> list[dict[str, int]]:
+    """The places of an axis that are shown: all of few, else the first, middle and last."""
+    size = dataset.sizes.get(name, 0)
+    return [{name: k} for k in (range(size) if size <= _FEW_MAPS else (0, size // 2, size - 1))] or [{}]
+
+
 def maps(
     rows: Sequence[tuple[str, Sequence[xr.Dataset]]],
     names: Sequence[str],
     *,
     height: float = 2.5,
-    titles: Sequence[Sequence[str]] = (),
+    titled: Sequence[str] = (),
     forced: bool = False,
 ) -> Sheet:
     """A sheet of maps over the axes ``names`` (horizontal, vertical): in each row one variable of several parts of a result.
 
-    Flags have their colours, spectral radii become growth with the limit of stability, other variables share a colour scale
-    in all panels with the same label. Boundaries, tips, predicted resonances (``forced``: those that the forcing excites)
-    and thresholds are drawn over the panels, if stored.
+    Flags have their colours, spectral radii become growth, whose colour changes at the limit of stability, other variables
+    share a colour scale in all panels. Boundaries, tips, predicted resonances (``forced``: those that the forcing excites)
+    and thresholds are drawn over the panels, if stored. Titles give the coordinates ``titled`` of each part.
     """
     sheet = Sheet(len(rows), len(rows[0][1]), height=height)
     fields = [[valid(part, name) for part in parts] for name, parts in rows]
-    labels = [variable_label(row[0]) for row in fields]
+    alike = {name: [k for k, (other, _) in enumerate(rows) if other == name] for name, _ in rows}
     scales: dict[str, dict[str, Any]] = {}
-    for label in dict.fromkeys(labels):
-        row = [field for row, other in zip(fields, labels, strict=True) if other == label for field in row]
-        whole = xr.DataArray(np.concatenate([field.values.ravel() for field in row]), dims="point", attrs=row[0].attrs)
-        scales[label] = flag_scale(whole) if _flags(whole) else shades(whole.values)
+    for name, numbers in alike.items():
+        values = np.concatenate([field.values.ravel() for k in numbers for field in fields[k]])
+        whole = xr.DataArray(values, attrs=fields[numbers[0]][0].attrs)
+        scales[name] = flag_scale(whole) if _flags(whole) else shades(whole.values)
         sheet.add(*(flag_entries(whole) if _flags(whole) else ()))
-    single = sheet.axes.size == len(rows)
-    for k, (row, (name, parts), label) in enumerate(zip(fields, rows, labels, strict=True)):
+    single, written = sheet.axes.size == len(rows), [""] * len(rows[0][1])
+    bars: dict[str, tuple[QuadMesh, str, dict[str, Any]]] = {}
+    for k, (row, (name, parts)) in enumerate(zip(fields, rows, strict=True)):
+        above = written
+        written = [
+            ", ".join(_entry_text(part[name]) for name in titled if name in part.coords and not part[name].ndim)
+            for part in parts
+        ]
         for j, (axes, field, part) in enumerate(zip(sheet.axes[k], row, parts, strict=True)):
-            bar: dict[str, Any] = {}
             if _is_radius(name):
-                mesh, label, bar = _draw_growth(axes, part, field, names)
+                bars[name] = _draw_growth(axes, part, field, names)
             else:
-                mesh = draw_cells(axes, _above(field, scales[label]), names[0], names[1], **scales[label])
-            sheet.add(*(() if _flags(field) else failure_entries(part)))
-            _draw_limits(sheet, axes, part, name, names, tips=single and k == 0)
+                mesh = draw_cells(axes, _above(field, scales[name]), names[0], names[1], **scales[name])
+                bars |= {} if _flags(field) else {name: (mesh, variable_label(field), {})}
+            sheet.add(*(() if _flags(field) else flag_entries(computed(part))))
+            if name == "verdict" or _is_radius(name):
+                sheet.add(*overlays.draw_boundaries(axes, part, *names))
+                if single and k == 0:
+                    sheet.add(*overlays.draw_tips(axes, part, *names))
+                    sheet.later(partial(overlays.name_tips, axes, part, *names))
             # Not over other variables, so that narrow tongues stay visible there.
             lines = overlays.predictions(part, names[0], names[1], forced) if name == rows[0][0] else []
             sheet.add(*overlays.draw_predictions(axes, lines, below=bool(_flags(field))))
             if k == 0:
                 labelled = lines if single else [line for line in lines if line.order == 1]
-                if labelled:
-                    sheet.later(partial(overlays.label_predictions, axes, labelled))
-            if titles and titles[k][j]:
-                axes.set_title(titles[k][j], pad=24 if k == 0 and lines else 4)
+                sheet.later(partial(overlays.label_predictions, axes, labelled))
+            if written != above:
+                axes.set_title(written[j], pad=24 if k == 0 and lines else 4)
             sheet.add(*_draw_threshold(axes, part, *names))
-        if not _flags(row[0]):
-            sheet.colorbar(sheet.axes[k], mesh, label, **bar)
+    # Below the last rows, so that rows of flags without a colour bar keep the whole width.
+    last, flagged = list(alike)[-1], len(bars) < len(alike)
+    for name, bar in bars.items():
+        sheet.colorbar(alike[name], *bar, below=flagged and name == last)
     part = rows[0][1][0]
     if not single and not is_logarithmic(part[names[0]].values):
         # No tick at the right end, clear of the next panel.
@@ -349,17 +486,24 @@ def maps(
     return sheet
 
 
-def split(dataset: xr.Dataset, name: str) -> list[tuple[str, list[xr.Dataset]]]:
-    """Rows of :func:`maps` for every entry of the variable's own dimension, which its label names."""
-    own = next((str(dim) for dim in dataset[name].dims if dim not in dataset["outcome"].dims), None)
-    if own is None:
-        return [(name, [dataset])]
-    long_name, parts = dataset[name].attrs.get("long_name", name), []
-    for k in range(dataset.sizes[own]):
-        part = dataset.isel({own: k})
-        entry = entry_name(own, part[own].item() if own in part.coords else k)
-        parts.append(part.assign({name: part[name].assign_attrs(long_name=f"{entry}: {long_name}")}))
-    return [(name, [part]) for part in parts]
+def own_dimension(dataset: xr.Dataset, name: str) -> str:
+    """The dimension of a variable that is no swept axis, or an empty string."""
+    return next((str(dim) for dim in dataset[name].dims if dim not in dataset["outcome"].dims), "")
+
+
+def split(parts: Sequence[xr.Dataset], name: str) -> list[tuple[str, list[xr.Dataset]]]:
+    """Rows of :func:`maps` for every entry of the variable's own dimension."""
+    own = own_dimension(parts[0], name)
+    entries = range(parts[0].sizes[own]) if own else ()
+    numbered = [part if own in part.coords else part.assign_coords({own: entries}) for part in parts if own]
+    return [(name, [part.isel({own: k}) for part in numbered]) for k in entries] or [(name, list(parts))]
+
+
+def _entry_text(coordinate: xr.DataArray) -> str:
+    """``symbol = value units`` of a parameter, ``driving shaft`` or ``mode 1`` of an entry of another dimension."""
+    if coordinate.dtype.kind == "f":
+        return coordinate_text(coordinate)
+    return entry_name(str(coordinate.name).replace("_", " "), coordinate.item())
 
 
 def entry_name(dimension: str, entry: object) -> str:
@@ -371,35 +515,6 @@ def _above(field: xr.DataArray, scale: Mapping[str, Any]) -> xr.DataArray:
     """``field`` with zeros raised to the lower end of a logarithmic colour scale, where they are lightest."""
     norm = scale.get("norm")
     return field.clip(min=norm.vmin) if isinstance(norm, LogNorm) else field
-
-
-def _draw_limits(sheet: Sheet, axes: Axes, part: xr.Dataset, name: str, names: Sequence[str], tips: bool) -> None:
-    """Draw the traced boundaries, else the limit of stability along the edges of the cells; ``tips`` with their names."""
-    if name != "verdict" and not _is_radius(name):
-        return
-    sheet.add(*overlays.draw_boundaries(axes, part, *names))
-    if tips:
-        sheet.add(*overlays.draw_tips(axes, part, *names))
-        if "tip_proved" in part.coords:
-            sheet.later(partial(overlays.name_tips, axes, part, *names))
-    radius = "spectral_radius" if name == "verdict" else name
-    if radius not in part or overlays.traced(part, *names):
-        return
-    field = valid(part, radius)
-    x, y = (cell_edges(field[axis].values.astype(float)) for axis in names)
-    # Without the bound of the error, so that the line surrounds the cells with the verdict unstable.
-    excess = (field - part.get(f"{radius}_error", 0.0)).transpose(names[1], names[0]).values
-    up, across = np.nonzero(_changes(excess, 1)), np.nonzero(_changes(excess, 0))
-    segments = [np.stack([x[up[1] + 1], y[up[0]], x[up[1] + 1], y[up[0] + 1]], axis=-1)]
-    segments += [np.stack([x[across[1]], y[across[0] + 1], x[across[1] + 1], y[across[0] + 1]], axis=-1)]
-    lines = LineCollection(np.concatenate(segments).reshape(-1, 2, 2), colors=FRAME_GREY, linewidths=0.5)  # pyright: ignore[reportArgumentType]
-    axes.add_collection(lines, autolim=False)
-
-
-def _changes(field: np.ndarray, axis: int) -> np.ndarray:
-    """True where one of two neighbours along ``axis`` is unstable and the other is not; False next to a missing value."""
-    first, second = np.delete(field, -1, axis), np.delete(field, 0, axis)
-    return ((first > 1) != (second > 1)) & np.isfinite(first) & np.isfinite(second)
 
 
 def _draw_threshold(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Line2D]:
@@ -421,28 +536,28 @@ def stack(
     along: str,
     panels: Sequence[Sequence[str]],
     *,
-    height: float = 2.1,
     forced: bool = False,
     **look: Any,
 ) -> Sheet:
     """A sheet of panels below each other over the axis ``along``, each with the variables of one entry of ``panels``.
 
-    Failed points are crosses at the foot of the first panel. ``forced`` draws the predicted resonances that the forcing
-    excites only. ``look`` goes to :func:`draw_lines`.
+    Flags (verdict, regime, failed and pending points) are bands behind the lines. ``forced`` draws only those predicted
+    resonances that the forcing excites. ``look`` goes to :func:`draw_lines`.
     """
-    sheet = Sheet(len(panels), height=height, sharey=False)
+    sheet = Sheet(len(panels), height=max(2.1, 3.0 / len(panels)), sharey=False)
     labels = [
         draw_lines(sheet, axes, dataset, along, keys, **look) for (axes,), keys in zip(sheet.axes, panels, strict=True)
     ]
     fit_axis(sheet.axes[0, 0], "x", dataset[along].values)
     sheet.label(axis_label(dataset[along]), *labels)
-    if along in dataset["outcome"].dims:
-        sheet.add(*draw_failures(sheet.axes[0, 0], dataset, along))
     lines = overlays.predictions(dataset, along, forced=forced)
     for (axes,) in sheet.axes:
         sheet.add(*overlays.draw_predictions(axes, lines))
-    if lines:
-        sheet.later(partial(overlays.label_predictions, sheet.axes[0, 0], lines))
+    sheet.later(partial(overlays.label_predictions, sheet.axes[0, 0], lines))
+    if along in dataset["outcome"].dims:
+        codes = valid(dataset, name) if (name := _flagged(dataset)) else computed(dataset)
+        for (axes,) in sheet.axes if codes.ndim == 1 and codes.any() else ():
+            sheet.add(*draw_flags(axes, codes, along))
     return sheet
 
 
@@ -471,7 +586,10 @@ def draw_lines(
     for number, key in enumerate(keys):
         values, label, error = _scaled(dataset, valid(dataset, key))
         if _is_radius(key):
-            scale_around_limit(axes, values)
+            # Logarithmic on both sides of the limit 0, linear below the smallest values: 1 - 1e-5 differs from 1.
+            distance = np.abs(values.values[np.isfinite(values.values) & (values.values != 0)])
+            linear = 10.0 ** np.floor(np.log10(max(np.quantile(distance, 0.1), _ROUNDING))) if distance.size else 1.0
+            axes.set_yscale("symlog", linthresh=linear)
         own = next((str(dim) for dim in values.dims if dim != along), None)
         for k in range(values.sizes[own] if own else 1):
             line = values.isel({own: k}) if own else values
@@ -492,6 +610,8 @@ def draw_lines(
     if any((np.isfinite(values) & (values > 0)).any() for values in shown):
         axes.set_yscale("log")
         plain_decades(axes, "y")
+    elif axes.get_yscale() == "linear":
+        widen(axes, "y", _LEAST_RANGE)
     return label if len(keys) == 1 else f"{' '.join(common)}{in_brackets(units_of(dataset[keys[0]]))}"
 
 
@@ -521,14 +641,6 @@ def _scaled(dataset: xr.Dataset, values: xr.DataArray) -> tuple[xr.DataArray, st
     elif _is_radius(values.name):
         values, label = values - 1, f"{label} minus 1"
     return values, label, dataset[name] * factor if name in dataset else None
-
-
-def scale_around_limit(axes: Axes, excess: xr.DataArray) -> None:
-    """Set a logarithmic scale on both sides of the limit 0: it tells a spectral radius of 1 - 1e-5 from 1."""
-    size = np.abs(excess.values[np.isfinite(excess.values) & (excess.values != 0)])
-    # Linear below the smallest values.
-    linear = 10.0 ** np.floor(np.log10(max(np.quantile(size, 0.1), _ROUNDING))) if size.size else 1.0
-    axes.set_yscale("symlog", linthresh=linear)
 
 
 def draw_sum(sheet: Sheet, axes: Axes, variable: xr.DataArray, along: str) -> None:

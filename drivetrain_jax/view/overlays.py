@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -17,29 +16,18 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
+from drivetrain_jax.view.sheet import write_names
 from drivetrain_jax.view.style import FLAG_COLOURS, FRAME_GREY, PREDICTION
 
 _FAMILY_DASHES = {"solid": "-", "dashed": (0, (5, 2)), "dashdot": (0, (5, 1.5, 1, 1.5))}
-# In points: type size of the labels, space per label along the edges, leader, and largest shift from the line.
-_FONT = 7.5
-_SPACING_ACROSS = 14.5
-_SPACING_UP = 9.5
-_LEADER = 9.0
-_MAX_SHIFT = 24.0
 _MARK = {"marker": "o", "markersize": 3.0, "markerfacecolor": "white", "markeredgewidth": 0.7, "linestyle": "none"}
-# Width and height of the name of a tip in points.
-_NAME = np.array([15.0, 9.0])
-# Positions of a name relative to the tip of a tongue that opens upwards, in points, and its alignment.
-_SIDES = {
-    (0, -1): ("center", "top"),
-    (1, 0): ("left", "center"),
-    (-1, 0): ("right", "center"),
-    (0, 1): ("center", "bottom"),
-}
+# Type size of the name of a tip, its width and height, and its distance from the tip, in points.
+_FONT, _NAME, _BESIDE = 7.5, np.array([15.0, 9.0]), 3.5
+# Alignments of a text on the left, in the middle and on the right; below, beside and above.
+_ACROSS, _UP = ("right", "center", "left"), ("top", "center", "bottom")
 
 
-@dataclass(frozen=True)
-class Prediction:
+class Prediction(NamedTuple):
     """One predicted line: values of the horizontal axis, values of the vertical axis unless the line is vertical, and name
     and line style of its family."""
 
@@ -112,95 +100,28 @@ def draw_predictions(axes: Axes, lines: list[Prediction], below: bool = False) -
 
 
 def label_predictions(axes: Axes, lines: list[Prediction]) -> None:
-    """Label lines at the upper or right edge of ``axes``, without overlaps.
-
-    Lines of low order take precedence. A label that would move far from its line is left out.
-    """
-    scale = 72 / axes.figure.dpi
-    for edge, spacing, side in ((_top_exit, _SPACING_ACROSS, 0), (_right_exit, _SPACING_UP, 1)):
-        found = [(line, edge(axes, line)) for line in sorted(lines, key=lambda line: line.order)]
-        ends = [(line, point) for line, point in found if point is not None]
-        along = [axes.transData.transform(point)[side] * scale for _, point in ends]
-        box = axes.bbox
-        limits = (box.xmin, box.xmax) if side == 0 else (box.ymin, box.ymax)
-        # Labels may extend beyond the corners by one width.
-        span = (limits[0] * scale - spacing, limits[1] * scale + spacing)
-        kept, positions = _place(along, spacing, span)
-        for index, position in zip(kept, positions, strict=True):
-            line, end = ends[index]
-            _write(axes, line.label, end, side, position - along[index])
-
-
-def _place(wanted: list[float], spacing: float, span: tuple[float, float]) -> tuple[list[int], np.ndarray]:
-    """Rising indices of the labels that fit, and the nearest positions for them at least ``spacing`` apart."""
-    from scipy.optimize import isotonic_regression  # loading takes longer than drawing most figures
-
-    kept: list[int] = []
-    positions = np.empty(0)
-    for index in range(len(wanted)):
-        trial = sorted([*kept, index], key=lambda i: wanted[i])
-        target = np.array([wanted[i] for i in trial])
-        offsets = spacing * np.arange(len(trial))
-        # Nearest positions p with p[i+1] - p[i] >= spacing: isotonic regression of p[i] - i * spacing.
-        spread = np.clip(isotonic_regression(target - offsets).x, span[0], span[1] - offsets[-1]) + offsets
-        if np.abs(spread - target).max() <= _MAX_SHIFT:
-            kept, positions = trial, spread
-    return kept, positions
-
-
-def _top_exit(axes: Axes, line: Prediction) -> tuple[float, float] | None:
-    """Intersection of the line with the upper edge, in data coordinates."""
+    """Label lines beyond the upper or right edge of ``axes``; where there is no space for all, lines of low order."""
     left, right = axes.get_xlim()
-    return (float(line.x[-1]), axes.get_ylim()[1]) if left <= line.x[-1] <= right else None
+    top = [(line, (line.x[-1], axes.get_ylim()[1])) for line in lines if left <= line.x[-1] <= right]
+    side = []
+    for line in lines:
+        crossing = np.flatnonzero((line.x[:-1] <= right) & (line.x[1:] > right))
+        if crossing.size and line.y is not None:
+            i = slice(crossing[-1], crossing[-1] + 2)
+            side.append((line, (right, np.interp(right, line.x[i], line.y[i]))))
+    for ends, above in ((top, True), (side, False)):
+        names = [label_text(line.label) for line, _ in ends]
+        ranks = [line.order for line, _ in ends]
+        write_names(axes, [end for _, end in ends], names, above=above, ranks=ranks, colours=PREDICTION, offset=9.0)
 
 
-def _right_exit(axes: Axes, line: Prediction) -> tuple[float, float] | None:
-    """Intersection of a curve with the right edge, in data coordinates."""
-    right = axes.get_xlim()[1]
-    crossing = np.flatnonzero((line.x[:-1] <= right) & (line.x[1:] > right))
-    if not crossing.size or line.y is None:
-        return None
-    i = int(crossing[-1])
-    return right, float(np.interp(right, line.x[i : i + 2], line.y[i : i + 2]))
-
-
-def _write(axes: Axes, text: str, end: tuple[float, float], side: int, shift: float) -> None:
-    """Write text beyond the edge, ``shift`` points along it, joined to ``end`` (data) by a thin leader."""
-    axes.annotate(
-        label_text(text),
-        end,
-        xytext=(shift, _LEADER) if side == 0 else (_LEADER, shift),
-        textcoords="offset points",
-        ha="center" if side == 0 else "left",
-        va="bottom" if side == 0 else "center",
-        size=_FONT,
-        color=PREDICTION,
-        annotation_clip=False,
-        arrowprops={
-            "arrowstyle": "-",
-            "linewidth": 0.5,
-            "color": PREDICTION,
-            "relpos": (0.5, 0.0) if side == 0 else (0.0, 0.5),
-            "shrinkA": 1,
-            "shrinkB": 0,
-        },
-    )
-
-
-def draw_boundaries(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Artist]:
+def draw_boundaries(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Line2D]:
     """Draw the traced boundaries, if there are any; returns their legend handle."""
-    if not traced(dataset, horizontal, vertical):
+    x, y = (dataset.coords.get(f"boundary_{name}") for name in (horizontal, vertical))
+    if x is None or y is None or not x.size:
         return []
-    x, y = (dataset[f"boundary_{name}"] for name in (horizontal, vertical))
-    style = {"color": FRAME_GREY, "linewidth": 0.6, "label": "boundary", "scalex": False, "scaley": False}
-    return [*axes.plot(x, y, **style)]
-
-
-def traced(dataset: xr.Dataset, horizontal: str, vertical: str) -> bool:
-    """True if ``dataset`` has boundaries over these two axes."""
-    return (
-        all(f"boundary_{name}" in dataset.coords for name in (horizontal, vertical)) and dataset.sizes["boundary"] > 0
-    )
+    style: dict[str, Any] = {"color": FRAME_GREY, "linewidth": 0.6, "label": "boundary"}
+    return axes.plot(x, y, scalex=False, scaley=False, **style)
 
 
 def draw_tips(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Artist]:
@@ -227,37 +148,27 @@ def draw_tips(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -
 def name_tips(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> None:
     """Write the names of tips outside of the tongues, or next to the tips; omit names that overlap, repeat or leave the
     panel."""
-    x, y = (dataset[f"tip_{name}"].values for name in (horizontal, vertical))
+    if "tip_proved" not in dataset.coords:
+        return
+    tips = np.stack([dataset[f"tip_{name}"].values for name in (horizontal, vertical)], axis=-1)
     # Without this variable all tongues open upwards.
-    opens = dataset["tip_opens"].values if "tip_opens" in dataset.coords else np.ones(len(x))
-    tips, names = np.stack([x, y], axis=-1), dataset["tip"].values.astype(str)
+    opens = dataset["tip_opens"].values if "tip_opens" in dataset.coords else np.ones(len(tips))
     scale = 72 / axes.figure.dpi
     low, high = axes.bbox.min * scale + _NAME / 2, axes.bbox.max * scale - _NAME / 2  # pyright: ignore[reportOperatorIssue]
     taken: list[np.ndarray] = []
     named: list[tuple[str, np.ndarray]] = []
-    for name, tip, up in zip(names, tips, opens, strict=True):
-        mark = axes.transData.transform(tip) * scale
+    for name, tip, up in zip(dataset["tip"].values.astype(str), tips, opens, strict=True):
+        mark, outside = axes.transData.transform(tip) * scale, -1 if up else 1
         # Unproved tips may lie within their errors of each other.
-        if any(name == other and (np.abs(mark - at) < _NAME / 2).all() for other, at in named):
+        if any(name == other and (np.abs(mark - place) < _NAME / 2).all() for other, place in named):
             continue
-        sides = [(across, rise if up else -rise) for across, rise in _SIDES]
-        middles = {side: mark + np.array(side) * (0.7, 1.0) * _NAME for side in sides}
-        inside = {side: at for side, at in middles.items() if ((at >= low) & (at <= high)).all()}
-        free = (s for s, at in inside.items() if all((np.abs(at - other) >= _NAME).any() for other in taken))
-        side = next(free, None)
-        if side is None:
-            continue
-        taken.append(middles[side])
-        named.append((name, mark))
-        aligned, level = _SIDES[side]
-        axes.annotate(
-            label_text(name),
-            tip,
-            xytext=3.5 * np.array(side),  # pyright: ignore[reportArgumentType]
-            textcoords="offset points",
-            ha=aligned,
-            va=level,
-            size=_FONT,
-            color=PREDICTION,
-            path_effects=[withStroke(linewidth=2, foreground="white")],
-        )
+        for side in np.array([(0, outside), (1, 0), (-1, 0), (0, -outside)]):
+            middle = mark + side * (0.7, 1.0) * _NAME
+            free = all((np.abs(middle - other) >= _NAME).any() for other in taken)
+            if free and (middle >= low).all() and (middle <= high).all():
+                taken.append(middle)
+                named.append((name, mark))
+                style: dict[str, Any] = {"ha": _ACROSS[side[0] + 1], "va": _UP[side[1] + 1], "color": PREDICTION}
+                style |= {"size": _FONT, "path_effects": [withStroke(linewidth=2, foreground="white")]}
+                axes.annotate(label_text(name), tip, tuple(_BESIDE * side), textcoords="offset points", **style)
+                break

@@ -6,7 +6,7 @@ import io
 import math
 import re
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, NullFormatter
 
 from drivetrain_jax.view.style import FRAME_GREY, caption
@@ -29,8 +30,12 @@ _TITLE, _CAPTION, _LEGEND, _FOOT = 0.18, 0.14, 0.17, 0.45
 _LEFT, _TITLE_LETTERS, _CAPTION_LETTERS = 0.01, 80, 112
 # The place in a paper at either end of a title: it says nothing to a reader without the paper.
 _PAPER = re.compile(r"[^:]*\b(?:Figs?\.?|Tables?|section) \d[^:]*: |, (?:Figs?\.?|Tables?) \d.*$")
-# Least vertical distance of two names beside curves, in points.
-_LINE = 7.5
+# Width of a colour bar, and height that one below a panel takes with its numbers and label, in inches.
+_BAR, _BELOW = 0.16, 0.6
+# Distance of two names beside points and of two above points, and the largest shift of a name, in points.
+_SPACING, _MOST_SHIFT = (9.5, 14.5), 24
+# Distance from its point below which a name needs no line to it, in points.
+_NEAR = 5.0
 
 
 class NotebookFigure(Figure):
@@ -58,6 +63,7 @@ class Sheet:
         self._height = height
         self._entries: dict[str, Artist] = {}
         self._late: list[Callable[[], None]] = []
+        self._more = 0.0
 
     def add(self, *entries: Artist) -> None:
         """Add entries to the legend; of entries with the same label the first counts."""
@@ -83,13 +89,20 @@ class Sheet:
         for axes, text in zip(self.axes[:, 0], vertical, strict=True):
             axes.set_ylabel(_fill(text, self._height))
 
-    def colorbar(self, axes: Sequence[Axes], mapped: ScalarMappable, label: str, **options: Any) -> None:
-        """Add a colour bar to a row of panels."""
-        bar = self.figure.colorbar(mapped, ax=list(axes), aspect=15, pad=0.015, fraction=0.08, **options)
-        bar.set_label(_fill(label, self._height))
+    def colorbar(
+        self, rows: Sequence[int], mapped: ScalarMappable, label: str, options: Mapping[str, Any], below: bool = False
+    ) -> None:
+        """Add a colour bar to rows of panels, at the right or ``below`` them: other rows then keep the whole width."""
+        axes, size = self.axes[list(rows)].ravel().tolist(), (WIDTH if below else len(rows) * self._height)
+        place: dict[str, Any] = {"location": "bottom" if below else "right", "aspect": size / _BAR, "pad": 0.015}
+        bar = self.figure.colorbar(
+            mapped, ax=axes, fraction=_BAR / (self._height if below else WIDTH), **place, **options
+        )
+        bar.set_label(_fill(label, size))
         if isinstance(mapped.norm, LogNorm):
-            plain_decades(bar.ax, "y")
+            plain_decades(bar.ax, "x" if below else "y")
         bar.ax.tick_params(labelsize=7.5)
+        self._more += _BELOW * below
 
     def finish(self, dataset: xr.Dataset, note: str = "") -> Figure:
         """The figure with the scene's title, the fixed parameters (and ``note``), and the legend."""
@@ -100,7 +113,7 @@ class Sheet:
         length = sum(_ENTRY + _LETTER * len(_plain(label)) for label in self._entries)
         lines = math.ceil(length / WIDTH)
         top = _TITLE * len(title) + 0.08
-        height = rows * self._height + top + _CAPTION * len(head) + _FOOT + _LEGEND * lines
+        height = rows * self._height + self._more + top + _CAPTION * len(head) + _FOOT + _LEGEND * lines
         figure.set_figheight(height)
         # Blank lines of the title keep the space of the caption.
         blank = "\n" * (math.ceil(_CAPTION / _TITLE * len(head)) + bool(head))
@@ -134,7 +147,7 @@ def caption_lines(text: str) -> list[str]:
 
 def _fill(text: str, inches: float) -> str:
     """``text`` in lines of about this length; no line begins or ends with a minus sign."""
-    letters = max(int(inches / _LETTER), 20)
+    letters = max(int(inches / _LETTER), 24)
     text = text.replace(" - ", "\u00a0-\u00a0")
     return textwrap.fill(text, letters, break_long_words=False, break_on_hyphens=False)
 
@@ -190,24 +203,60 @@ def plain_decades(axes: Axes, which: str) -> None:
 
 
 def write_names(
-    axes: Axes, ends: np.ndarray, names: Sequence[str], offset: tuple[float, float] = (3, 0), colours: Any = FRAME_GREY
+    axes: Axes,
+    points: Sequence[tuple[float, float]] | np.ndarray,
+    names: Sequence[str],
+    *,
+    above: bool = False,
+    ranks: Sequence[int] = (),
+    offset: float = 3.0,
+    va: str = "center",
+    colours: Any = FRAME_GREY,
 ) -> None:
-    """Write ``names`` beside the points ``ends`` (n, 2), ``offset`` points away; of close neighbours the first and the last.
+    """Write ``names`` to the right of ``points`` (or ``above``), ``offset`` points away, with a line to a name that moved.
 
-    ``colours`` are one for all or one for each name.
+    ``va`` is the vertical alignment beside a point. Names keep the order of their points. Where there is no space for all,
+    those of the smallest ``ranks`` stay.
     """
     colours = [colours] * len(names) if isinstance(colours, str) else list(colours)
-    heights = axes.transData.transform(ends)[:, 1] * 72 / axes.figure.dpi
-    groups: list[list[int]] = []
-    for k in np.argsort(heights).tolist():
-        if not np.isfinite(heights[k]):
-            continue
-        if groups and heights[k] < heights[groups[-1][0]] + _LINE:
-            groups[-1].append(k)
-        else:
-            groups.append([k])
-    for group in groups:
-        text = "\N{EN DASH}".join(dict.fromkeys((names[group[0]], names[group[-1]])))
-        point = (ends[group[-1], 0], ends[group, 1].mean())
-        style: dict[str, Any] = {"va": "center", "size": 7, "annotation_clip": True}
-        axes.annotate(text, point, offset, textcoords="offset points", color=colours[group[-1]], **style)
+    scale, spacing, axis = 72 / axes.figure.dpi, _SPACING[above], 0 if above else 1
+    places = np.array([axes.transData.transform(point)[axis] for point in points]) * scale
+    span = axes.bbox.get_points()[:, axis] * scale + (-spacing, spacing)
+    kept: list[int] = []
+    shifts = np.empty(0)
+    for k in np.argsort(ranks if len(ranks) else np.arange(len(names)), kind="stable").tolist():
+        trial = sorted([*kept, k], key=lambda i: places[i])
+        moved = _apart(places[trial], spacing, *span) - places[trial]
+        if (np.abs(moved) <= _MOST_SHIFT).all():
+            kept, shifts = trial, moved
+    for k, shift in zip(kept, shifts, strict=True):
+        line = {"arrowstyle": "-", "linewidth": 0.5, "color": colours[k], "shrinkA": 1, "shrinkB": 0}
+        style: dict[str, Any] = {"ha": "center", "va": "bottom"} if above else {"ha": "left", "va": va}
+        if offset > _NEAR or abs(shift) > 1:
+            style["arrowprops"] = line | {"relpos": (0.5, 0.0) if above else (0.0, 0.5)}
+        beyond = max(offset, _NEAR + 4) if abs(shift) > 1 else offset
+        style |= {"path_effects": [withStroke(linewidth=2, foreground="white")]}
+        style |= {"size": 7.5, "color": colours[k], "annotation_clip": False, "textcoords": "offset points"}
+        axes.annotate(names[k], points[k], (shift, beyond) if above else (beyond, shift), **style)
+
+
+def _apart(wanted: np.ndarray, spacing: float, low: float, high: float) -> np.ndarray:
+    """The nearest places to the rising ``wanted`` ones that are ``spacing`` apart: isotonic regression by pooling."""
+    offsets = spacing * np.arange(len(wanted))
+    blocks: list[tuple[float, int]] = []
+    for value in wanted - offsets:
+        mean, count = value, 1
+        while blocks and blocks[-1][0] > mean:
+            before, number = blocks.pop()
+            mean, count = (before * number + mean * count) / (number + count), number + count
+        blocks.append((mean, count))
+    means, counts = np.array(blocks).T
+    return np.clip(np.repeat(means, counts.astype(int)), low, high - offsets[-1]) + offsets
+
+
+def widen(axes: Axes, which: str, share: float, least: float = 0.0) -> None:
+    """Widen the limits to this share of the values at least, so that tiny differences do not fill the panel."""
+    low, high = getattr(axes, f"get_{which}lim")()
+    missing = max(share * max(abs(low), abs(high)), least) - (high - low)
+    if missing > 0:
+        axes.set(**{f"{which}lim": (low - missing / 2, high + missing / 2)})

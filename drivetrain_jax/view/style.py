@@ -43,6 +43,7 @@ FRAME_GREY, PREDICTION = "#555555", "#0b84d8"
 FLAG_COLOURS = {
     "stable": "#ffffff00",
     "unstable": "#33415c",
+    "computed": "#ffffff00",
     "undecided": "#f2b632",
     "no_separation": "#ffffff00",
     "single_sided": "#9cc3e0",
@@ -80,8 +81,9 @@ def symbol(name: str) -> str:
         return _PRODUCTS[name]
     if name in _GREEK:
         return rf"$\{name}$"
-    if match := re.fullmatch("(" + "|".join(_GREEK) + r"|[A-Za-z]{1,2})_?([A-Za-z]{0,2}\d*)", name):
-        head, index = match.groups()
+    # Without an underscore an index is a number: `rate` is a word.
+    if match := re.fullmatch("(" + "|".join(_GREEK) + r"|[A-Za-z]{1,2})(?:_([A-Za-z]{0,2}\d*)|(\d*))", name):
+        head, index = match[1], match[2] or match[3]
         head = rf"\{head}" if head in _GREEK else head
         return rf"${head}_{{{index}}}$" if index else f"${head}$"
     if match := re.fullmatch(r"([A-Za-z])_([a-z]{3,})", name):

@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from matplotlib.figure import Figure
-from matplotlib.text import Text
 
 from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError
@@ -20,14 +18,17 @@ from drivetrain_jax._wording import shown
 # The attribute with the units asked for, and the mark of a converted variable, which takes no further prefix.
 ASKED, CONVERTED = "figure_units", "converted"
 # Units whose first symbol takes a prefix: N, N/m, N m, N m/rad, N m2, N s/m, Pa.
-_PREFIXED = re.compile(r"(N|Pa)(?![A-Za-z])")
-_PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
+_PREFIXED = re.compile(r"(N|Pa)(?![A-Za-z])|m$")
+_PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (0.0, ""))
+# Displacements in metres: below a centimetre in mm, below a tenth of a millimetre in um.
+_SMALL = ((1e-2, 1.0, ""), (1e-4, 1e-3, "m"), (0.0, 1e-6, "u"))
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def written_units(units: str) -> str:
-    """A unit of UDUNITS in common notation: ``kg m²`` for ``kg m2``."""
-    return re.sub(r"(?<=[A-Za-z])-?\d+", lambda power: power[0].translate(SUPERSCRIPTS), units)
+    """A unit of UDUNITS in common notation: ``kg m²`` for ``kg m2``, ``µm`` for ``um``."""
+    powers = re.sub(r"(?<=[A-Za-z])-?\d+", lambda power: power[0].translate(SUPERSCRIPTS), units)
+    return re.sub(r"\bu(?=m\b)", "\u00b5", powers)
 
 
 def listed(units: str | Sequence[str]) -> list[str]:
@@ -123,21 +124,18 @@ def value_in(variable: xr.DataArray, units: str) -> Any:
     return variable.values * suitable(str(variable.attrs.get("units", units)), [units])[0]
 
 
-def check_shown(figure: Figure, asked: Iterable[str]) -> None:
-    """Raise :class:`InputError` for a unit that no axis and no caption of ``figure`` has."""
-    labels = [" ".join(text.get_text().split()) for text in figure.findobj(Text)]
-    # Frequencies of mode shapes are in the titles of the panels, without brackets.
-    titles = [axes.get_title(side) for axes in figure.axes for side in ("left", "center")]
-    found = [re.findall(r"\[([^\[\]=,]+)\]$", label) for label in labels]
-    found += [re.findall(r"[\d.]+ ([A-Za-z][\w/]*)(?=$|[ ,\n])", title) for title in titles]
-    # Fixed values in captions: `= 0.3 rad, ...` and `= [0, 90] deg; ...`.
-    found += [re.findall(r"= (?:\[[^\]]*\]|[^\s\[=,;]+) ([^=,;]+?)(?=[,;]|$)", label) for label in labels]
-    shown = list(dict.fromkeys(unit for each in found for unit in each))
+def check_measured(dataset: xr.Dataset, asked: Iterable[str]) -> None:
+    """Raise :class:`InputError` for a unit ``asked`` for that measures no parameter and no result of ``dataset``."""
+    units = [str(variable.attrs.get("units", "1")) for variable in dataset.variables.values()]
+    units += [component["units"] for component in json.loads(dataset.attrs.get("state", "[]"))]
+    fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}")).values()
+    units += [str(entry.get("units", "1")) for entry in fixed if isinstance(entry, dict)]
+    shown = [written_units(unit) for unit in dict.fromkeys(units) if unit not in ("1", "")]
     for unit in asked:
-        if written_units(unit) not in shown:
+        if all(size(known, unit) is None for known in units):
             kinds = f"units of {', '.join(shown)}" if shown else "none, all axes are dimensionless"
             raise InputError(
-                f"units = {unit!r}: no axis of the figure measures that; allowed are {kinds} "
+                f"units = {unit!r}: nothing in the result measures that; allowed are {kinds} "
                 "(a dimensionless speed needs physical data in the scene)"
             )
 
@@ -164,7 +162,9 @@ def prefixed(values: Any, units: str) -> tuple[float, str]:
     if not (_PREFIXED.match(units) and size.size):
         return 1.0, units
     middle = np.median(size)
-    return next(((factor, prefix + units) for factor, prefix in _PREFIXES if middle >= factor), (1.0, units))
+    if units == "m":
+        return next((factor, prefix + units) for least, factor, prefix in _SMALL if middle >= least)
+    return next((factor or 1.0, prefix + units) for factor, prefix in _PREFIXES if middle >= factor)
 
 
 def with_prefixes(dataset: xr.Dataset) -> xr.Dataset:

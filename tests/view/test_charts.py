@@ -8,7 +8,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from drivetrain_jax.view import charts, plot, sheet
-from drivetrain_jax.view.style import axis_label, caption, value_text, variable_label
+from drivetrain_jax.view.style import axis_label, caption, symbol, value_text, variable_label
 from tests.view import results
 from tests.view.results import meshes, panels
 
@@ -109,12 +109,22 @@ def test_caption_gives_parameters_instead_of_the_point_number():
         ("inf", "N/m", "$k_{A}$ = inf N/m"),
         (0.0, "N/m", "$k_{A}$ = 0 N/m"),
         (12.0, "MN/m", "$k_{A}$ = 12 MN/m"),
+        (5e-5, "m", "$k_{A}$ = 50 µm"),
+        (0.3, "m", "$k_{A}$ = 0.3 m"),
         (4800.0, "Np", "$k_{A}$ = 4800 Np"),
         (4800.0, "rpm", "$k_{A}$ = 4800 rpm"),
     ],
 )
 def test_forces_have_the_prefix_that_people_write(value, units, text):
     assert value_text("k_A", value, units) == text
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("rate", "rate"), ("k_sp", "$k_{sp}$"), ("J1", "$J_{1}$"), ("theta1", r"$\theta_{1}$"), ("u_10", "$u_{10}$")],
+)
+def test_a_word_is_no_symbol_with_an_index(name, text):
+    assert symbol(name) == text
 
 
 def test_axes_and_results_have_prefixes_together_with_their_numbers():

@@ -97,7 +97,7 @@ def test_maps_show_where_a_mode_meets_the_operating_speeds():
     dataset = result(data, {"k_A": ("k_A", k), "k_D": ("k_D", k)})
     figure = plot(dataset.assign_attrs(options=json.dumps({"operating_min": 17.0, "operating_max": 25.0})))
     found = [
-        [collection for collection in axes.collections if isinstance(collection, QuadContourSet)]
+        [lines for lines in axes.collections if isinstance(lines, QuadContourSet) and len(lines.levels) == 1]
         for axes in figure.axes
         if axes.get_label() != "<colorbar>"
     ]
@@ -109,7 +109,7 @@ def test_maps_show_where_a_mode_meets_the_operating_speeds():
     # The joints bend the shaft twice a turn: at 10 rpm they meet the first mode where it is 20 rpm.
     limits = json.dumps({"operating_min": 0.0, "operating_max": 10.0})
     figure = plot(dataset.assign_attrs(options=limits, system="bicardan"))
-    (lines,) = [each for each in figure.axes[0].collections if isinstance(each, QuadContourSet)]
+    (_, lines) = [each for each in figure.axes[0].collections if isinstance(each, QuadContourSet)]
     np.testing.assert_allclose(np.concatenate(lines.allsegs[0]).sum(axis=1), 10.0)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["highest operating speed, order 2 (joints)"]
 

@@ -34,7 +34,7 @@ def test_an_angle_is_drawn_in_degrees():
 
 @pytest.mark.full
 def test_a_dimensionless_speed_is_drawn_in_rpm_with_physical_data_only():
-    with pytest.raises(InputError, match=r"units = 'rpm': no axis .* allowed are units of rad \(a dimensionless speed"):
+    with pytest.raises(InputError, match=r"units = 'rpm': nothing .* allowed are units of rad \(a dimensionless speed"):
         plot(chart(), units="rpm")
     data = {name: {"value": value, "units": "1"} for name, value in TRUCK.items()}
     fixed = {name: {"value": value, "units": "1"} for name, value in FIXED.items()}
@@ -47,7 +47,7 @@ def test_a_dimensionless_speed_is_drawn_in_rpm_with_physical_data_only():
 
 @pytest.mark.parametrize(
     ("units", "reason"),
-    [("kg", "no axis of the figure measures that"), ("deg,", "not a unit"), ("deg,rad", "measures the same as deg"),
+    [("kg", "nothing in the result measures that"), ("deg,", "not a unit"), ("deg,rad", "measures the same as deg"),
      ("degg", "not a unit")],
 )  # fmt: skip
 def test_a_unit_of_no_axis_is_refused(units, reason):
@@ -86,7 +86,7 @@ def test_angles_of_planets_have_the_unit_given_or_asked_for():
             dataset[name].attrs["units"] = "N/m"
         assert "planet angle = [0, 93, 180] deg" in texts(plot(dataset, units=units))
     assert "planet angle = [0, 1.6232, 3.1416] rad" in texts(plot(dataset))
-    with pytest.raises(InputError, match=r"units = 'kg': no axis .* N/m, .*rad"):
+    with pytest.raises(InputError, match=r"units = 'kg': nothing .* N/m, .*rad"):
         plot(dataset, units="kg")
 
 
@@ -98,7 +98,7 @@ def test_flanks_and_phase_follow_the_units_of_their_axes():
     along = plot(history, units="um").axes[0]
     levels = sorted({float(np.asarray(line.get_ydata())[0]) for line in along.lines[1:]})
     np.testing.assert_allclose(levels, [-50, 50], rtol=1e-12)
-    assert along.get_ylabel() == "$u$ [um]"
+    assert along.get_ylabel() == "$u$ [µm]"
 
 
 def test_a_section_has_both_components_converted():
@@ -133,9 +133,9 @@ def test_lists_of_units_are_checked():
 def test_growth_without_a_speed_in_rpm_is_per_turn_or_period(periods, label, largest):
     figure = plot(chart(periods_per_turn=periods))
     bar = next(axes for axes in figure.axes if axes.get_label() == "<colorbar>")
-    assert bar.get_ylabel().replace("\n", " ") == label
+    assert bar.get_xlabel().replace("\n", " ") == label
     assert figure.axes[1].collections[0].get_array().max() == pytest.approx(largest, rel=1e-12)
-    assert 0.0 in bar.get_yticks()
+    assert 0.0 in bar.get_xticks()
 
 
 def test_growth_at_a_speed_in_rpm_is_per_second():
@@ -146,7 +146,7 @@ def test_growth_at_a_speed_in_rpm_is_per_second():
         Omega=("Omega", 60 * dataset["Omega"].values, {"units": "rpm", "long_name": "speed"})
     )
     figure = plot(dataset, units="Hz")
-    assert "rate of growth [1/s]" in [axes.get_ylabel() for axes in figure.axes]
+    assert "rate of growth [1/s]" in [axes.get_xlabel() for axes in figure.axes]
     hertz = np.broadcast_to(dataset["Omega"].values / 60, unstable.shape)
     found = figure.axes[1].collections[0].get_array()
     np.testing.assert_allclose(found[unstable], 2 * np.log(1.25) * hertz[unstable], rtol=1e-12)

@@ -124,7 +124,7 @@ def test_map_of_two_axes():
     flags = {"flag_meanings": REGIMES, "long_name": "regime"}
     pair["regime"] = xr.zeros_like(pair["u_max"], dtype="int8").assign_attrs(flags)
     figure = plot(pair)
-    assert [axes.get_title() for axes in figure.axes[:2]] == ["sweep up", "sweep down"]
+    assert [axes.get_title() for axes in figure.axes[:2]] == ["up sweep direction", "down sweep direction"]
     assert "no separation (164)" in [text.get_text() for text in figure.legends[0].get_texts()]
 
 

@@ -57,7 +57,7 @@ def test_caption_leaves_defaults_out():
 
 
 def test_no_constant_at_all_is_an_input_error():
-    with pytest.raises(InputError, match=r"^outputs = outcome: nothing to plot; the figure needs a constant$"):
+    with pytest.raises(InputError, match=r"^outputs = outcome: nothing to plot; the figure needs a result$"):
         plot(constants("beta")[["outcome"]])
 
 

@@ -49,10 +49,6 @@ def test_a_response_of_zero_is_drawn():
 
 
 def test_nothing_to_plot_is_an_input_error():
-    with pytest.raises(InputError, match=r"axes = Omega \(one value\): allowed is one or two axes of several values"):
-        plot(results.forced(Omega=OMEGA[:1]))
-    with pytest.raises(InputError, match="axes = none: allowed is one or two axes"):
-        plot(results.forced())
     with pytest.raises(InputError, match="outputs = outcome: nothing to plot; the figure needs amplitude or"):
         plot(results.forced(Omega=OMEGA)[["outcome"]])
 
@@ -63,4 +59,16 @@ def test_unknown_analysis_is_an_input_error():
     with pytest.raises(
         InputError, match="analysis = 'anything': has no figure; allowed is one of basins, critical_speeds"
     ):
-        plot(results.forced(Omega=OMEGA).assign_attrs(analysis="anything"))
+        plot(results.forced(Omega=OMEGA).drop_vars("outcome").assign_attrs(analysis="anything"))
+
+
+def test_any_result_has_a_table_lines_or_maps():
+    """The results of a function that somebody swept, by the number of axes."""
+    own = {"analysis": "somebody's own"}
+    shown = texts(plot(results.forced(Omega=OMEGA[:1]).assign_attrs(own)))
+    assert {"amplitude, shaft driving", "0.1", "rad", "1.1"} <= set(shown)
+    lines = panels(plot(results.forced(Omega=OMEGA).assign_attrs(own)))
+    assert lines[0].get_ylabel() == "amplitude [rad]" and len(lines) == 2
+    charts = panels(plot(results.forced(Omega=OMEGA, beta=OMEGA, mu=OMEGA[:2]).assign_attrs(own)))
+    titles = [axes.get_title() for axes in charts]
+    assert titles[:4] == [f"$\\mu$ = {mu:g}, {shaft} shaft" for shaft in ("driving", "driven") for mu in OMEGA[:2]]

@@ -129,7 +129,7 @@ def test_four_axes_give_nine_slices():
 
 
 def test_a_range_without_a_boundary_shows_how_far_it_is_from_one():
-    """Instead of blank panels the figure shows the spectral radius, with the axis of three values across."""
+    """Growth below the verdicts, which are blank, with the axis of three values across."""
     dataset = results.grid(np.zeros((11, 8, 3), int), "speed", "zeta", "chi")
     axes = {
         "speed": np.linspace(2950, 3200, 11),
@@ -139,10 +139,9 @@ def test_a_range_without_a_boundary_shows_how_far_it_is_from_one():
     dataset = results.with_axes(dataset, **axes)
     dataset["spectral_radius"] = dataset.spectral_radius - dataset.zeta
     figure = plot(dataset)
-    assert [axes.get_title() for axes in panels(figure)] == [rf"$\chi$ = {value}" for value in (0.1, 0.2, 0.3)]
-    drawn = meshes(figure)[0].get_array()
-    np.testing.assert_allclose(drawn, np.tile(0.99 - dataset.zeta.values, (11, 1)), rtol=1e-15)
-    assert any("stable everywhere" in text for text in texts(figure))
+    assert [axes.get_title() for axes in panels(figure)[:3]] == [rf"$\chi$ = {value}" for value in (0.1, 0.2, 0.3)]
+    drawn = meshes(figure)[3].get_array()
+    np.testing.assert_allclose(drawn, np.tile(np.log10(0.99 - dataset.zeta.values), (11, 1)), rtol=1e-12)
 
 
 def test_points_are_drawn_by_verdict():

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from string import ascii_uppercase
-
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
 from drivetrain_jax.view import charts
-from drivetrain_jax.view.sheet import Sheet, fit_axis
-from drivetrain_jax.view.style import ATTRACTOR_COLOURS, axis_label, variable_label
+from drivetrain_jax.view.style import ATTRACTOR_COLOURS
 
 _NEEDED = ("attractor_u_max", "basin_fraction")
 # Relative change of size between neighbours of the axis within which an attractor is the same.
@@ -19,7 +16,6 @@ _NEAR = 0.2
 _LOST = 2
 # Sizes below this are motions at rest.
 _REST = 1e-300
-_MARKERS = "os^D"
 
 
 def plot(dataset: xr.Dataset) -> Figure:
@@ -32,27 +28,24 @@ def plot(dataset: xr.Dataset) -> Figure:
         raise charts.wrong_axes(dataset, "one axis of several values for a figure of basins")
     charts.require(dataset, *_NEEDED)
     (name,) = names
-    size, share = (dataset[key].transpose(name, "attractor").values for key in _NEEDED)
-    error = dataset["basin_error"].transpose(name, "attractor").values if "basin_error" in dataset else 0 * share
+    dataset = dataset.transpose(name, "attractor", ...)
+    size, share = (dataset[key].values for key in _NEEDED)
     # Without a stored period multiple, attractors with a size are periodic.
-    multiple = np.isfinite(size)
-    if "attractor_multiple" in dataset:
-        multiple = dataset["attractor_multiple"].transpose(name, "attractor").values
+    multiple = dataset["attractor_multiple"].values if "attractor_multiple" in dataset else np.isfinite(size)
     branch = _followed(dataset[name].values, size, np.isfinite(share), multiple)
-    sheet = Sheet(2, height=2.2, sharey=False)
+    motions = np.arange(branch.max(initial=-1) + 1) + 1
+    place, attractor = np.nonzero(branch >= 0)
+    shown = dataset.drop_dims("attractor").assign_coords(motion=motions)
+    for key in (*_NEEDED, "basin_error"):
+        if key in dataset:
+            values = np.full((len(size), len(motions)), np.nan)
+            values[place, branch[place, attractor]] = dataset[key].values[place, attractor]
+            shown[key] = (name, "motion"), values, dataset[key].attrs
+    dots = {"linestyle": "", "marker": "o", "markersize": 2.5}
+    sheet = charts.stack(shown, name, [[key] for key in _NEEDED], colours=ATTRACTOR_COLOURS, **dots)
     upper, lower = sheet.axes[:, 0]
-    for number in range(branch.max(initial=-1) + 1):
-        i, k = np.nonzero(branch == number)
-        x, turn = dataset[name].values[i], number // len(ATTRACTOR_COLOURS)
-        style = {"linestyle": "", "marker": _MARKERS[turn % len(_MARKERS)], "markersize": 2.5}
-        style["color"] = ATTRACTOR_COLOURS[number % len(ATTRACTOR_COLOURS)]
-        label = f"motion {ascii_uppercase[number % 26]}{number // 26 or ''}"
-        sheet.add(*upper.plot(x, size[i, k], **style, label=label))
-        lower.errorbar(x, share[i, k], error[i, k], **style, elinewidth=0.8)
-    fit_axis(upper, "x", dataset[name].values)
     upper.set_ylim(bottom=min(0.0, float(dataset["attractor_u_max"].min())))
     lower.set_ylim(-0.03, 1.03)
-    sheet.label(axis_label(dataset[name]), variable_label(dataset["attractor_u_max"]), "share of the initial states")
     return sheet.finish(dataset)
 
 

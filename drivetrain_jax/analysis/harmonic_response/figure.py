@@ -32,38 +32,29 @@ def plot(dataset: xr.Dataset) -> Figure:
     """
     charts.require(dataset, "amplitude")
     charts.require_values(dataset["amplitude"], positive=True)
-    names = charts.sweep_axes(dataset)
-    if not names:
-        return _lines(dataset)
+    names, amplitude = charts.sweep_axes(dataset), dataset["amplitude"]
     if len(names) > 1 or names == ["point"]:
         raise charts.wrong_axes(dataset, "one axis, or none")
-    amplitude = dataset["amplitude"]
-    largest = dataset.assign(amplitude=amplitude.max("dof").assign_attrs(amplitude.attrs))
-    largest["amplitude"].attrs["long_name"] = f"largest {amplitude.attrs.get('long_name', 'amplitude')}"
-    return charts.maps([("amplitude", [largest])], ["frequency", names[0]], height=3.0).finish(dataset)
-
-
-def _lines(dataset: xr.Dataset) -> Figure:
-    amplitude = dataset["amplitude"]
-    kinds: dict[str, list[str]] = {}
-    for dof in amplitude["dof"].values.astype(str):
-        kinds.setdefault(dof.partition("_")[0], []).append(dof)
-    bodies = list(dict.fromkeys(dof.partition("_")[2] for dofs in kinds.values() for dof in dofs))
-    planets = [body for body in bodies if body not in _BODIES]
+    if names:
+        about = amplitude.attrs | {"long_name": f"largest {amplitude.attrs.get('long_name', 'amplitude')}"}
+        largest = dataset.assign(amplitude=amplitude.max("dof").assign_attrs(about))
+        return charts.maps([("amplitude", [largest])], ["frequency", names[0]], height=3.0).finish(dataset)
+    dofs = amplitude["dof"].values.astype(str).tolist()
+    kinds = list(dict.fromkeys(dof.partition("_")[0] for dof in dofs))
+    planets = [body for body in dict.fromkeys(dof.partition("_")[2] for dof in dofs) if body not in _BODIES]
     # The lowest and widest lines are the lightest.
     shades = matplotlib.colormaps["viridis_r"](np.linspace(0.05, 1.0, len(planets)))
     colours = dict(zip(_BODIES, LINE_COLOURS, strict=False)) | dict(zip(planets, shades, strict=True))
     sheet = Sheet(len(kinds), height=1.6, sharey=False)
     # The amplitude of a coordinate that does not respond is rounding.
-    smallest = _ROUNDING * float(amplitude.max())
-    for (axes,), dofs in zip(sheet.axes, kinds.values(), strict=True):
-        for dof in dofs:
-            body = dof.partition("_")[2]
-            below = len(planets) - 1 - planets.index(body) if body in planets else 0
-            name = _BODIES.get(body) or (f"planet {body}" if body.isdigit() else body)
-            style = {"color": colours[body], "linewidth": _THIN + _WIDER * below, "label": name}
-            values = amplitude.sel(dof=dof).where(lambda x: x > smallest)
-            sheet.add(*axes.semilogy(amplitude["frequency"], values, **style))
+    values = amplitude.where(amplitude > _ROUNDING * float(amplitude.max()))
+    for dof in dofs:
+        kind, _, body = dof.partition("_")
+        below = len(planets) - 1 - planets.index(body) if body in planets else 0
+        name = _BODIES.get(body) or (f"planet {body}" if body.isdigit() else body)
+        style = {"color": colours[body], "linewidth": _THIN + _WIDER * below, "label": name}
+        sheet.add(*sheet.axes[kinds.index(kind), 0].semilogy(amplitude["frequency"], values.sel(dof=dof), **style))
+    for (axes,) in sheet.axes:
         plain_decades(axes, "y")
     sheet.axes[0, 0].set_xlim(*amplitude["frequency"].values[[0, -1]])
     units = in_brackets(units_of(amplitude))

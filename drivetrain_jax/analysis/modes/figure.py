@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from itertools import cycle
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -34,7 +35,11 @@ _LARGEST = 0.28
 # Largest radius of a planet relative to half the distance of neighbours, so that planets at rest do not touch.
 _CLEAR = 0.94
 _BODIES = {"ring": "#7a7a7a", "carrier": "#2f7d4f", "sun": "#c8553d", "planet": "#1f4e79"}
-_CIRCLE = np.linspace(0, 2 * np.pi, 73)
+_CIRCLE = np.exp(1j * np.linspace(0, 2 * np.pi, 73))
+# Marks across the rim of the ring, whose centre is hidden.
+_MARKS = np.exp(1j * np.array([1, 5, 9]) * np.pi / 6)[:, None] * [1.0, 1.08]
+_SPOKE = np.array([0.0, 1.0])
+_REST: dict[str, Any] = {"linewidth": 0.5, "linestyle": (0, (3, 2))}
 
 
 def plot(dataset: xr.Dataset) -> Figure:
@@ -144,7 +149,7 @@ def _draw_distances(sheet: Sheet, axes: Axes, x: np.ndarray, frequency: np.ndarr
     axes.set_yscale("log")
     plain_decades(axes, "y")
     names = [f"{mode + 1}/{mode + 2}" for mode in close]
-    sheet.later(lambda: write_names(axes, np.array(ends), names, colours=colours))
+    sheet.later(lambda: write_names(axes, ends, names, colours=colours))
 
 
 def _segments(x: np.ndarray, curve: np.ndarray, colours: list[str]) -> LineCollection:
@@ -177,13 +182,6 @@ def _distinct(frequency: np.ndarray) -> list[tuple[int, int]]:
     return [(i, j - i) for i, j in zip(start, [*start[1:], len(frequency)], strict=True)]
 
 
-def _dominant(dataset: xr.Dataset, mode: int) -> str:
-    """Second line of a title: the dominant family of a coupled mode and its share, truncated and not rounded to 100 %."""
-    names = dataset["dominant_family"].attrs["flag_meanings"].split()
-    share = np.floor(1e4 * float(dataset["dominant_share"].values[mode])) / 100
-    return f"\n{share:.2f} % {names[int(dataset['dominant_family'].values[mode])]}"
-
-
 def _shapes(dataset: xr.Dataset) -> Figure:
     charts.require(dataset, "natural_frequency", "mode_shape")
     angles, types, colours = _angles(dataset), _types(dataset), type_colours(dataset)
@@ -203,10 +201,14 @@ def _shapes(dataset: xr.Dataset) -> Figure:
         _draw_gear(axes, dict(zip(dataset["dof"].values, shape, strict=True)), angles)
         multiple = f" ×{count}" if count > 1 else ""
         kind, family = str(types[mode]), str(families[mode])
-        named = _dominant(dataset, mode) if kind == "coupled" and shares else f", {kind}"
+        named = f", {kind}"
+        if kind == "coupled" and shares:
+            # Truncated and not rounded to 100 %.
+            share = np.floor(1e4 * float(dataset["dominant_share"].values[mode])) / 100
+            named = f"\n{share:.2f} % {family}"
         axes.set_title(f"{frequency[mode]:.{digits}f} {units}{multiple}{named}", size=8, color=colours[family], pad=1.5)
     sheet.add(*(Line2D([], [], color=colour, label=body) for body, colour in _BODIES.items()))
-    sheet.add(Line2D([], [], color=FRAME_GREY, linewidth=0.6, linestyle=(0, (3, 2)), label="at rest"))
+    sheet.add(Line2D([], [], color=FRAME_GREY, **_REST, label="at rest"))
     return sheet.finish(dataset, f"{left_out} higher frequencies not drawn" if left_out else "")
 
 
@@ -233,60 +235,25 @@ def drawn_radii(angles: Sequence[float]) -> tuple[float, float, float]:
 
 
 def _draw_gear(axes: Axes, shape: Mapping[str, float], angles: Sequence[float]) -> None:
-    """Draw the bodies at rest and displaced; a radius on each shows its rotation. Axes are scaled equally and hidden."""
+    """Draw the bodies at rest and displaced; marks show the rotation of each. Axes are scaled equally."""
     (carrier, ring, sun), planets = displacements(shape, len(angles))
     sun_radius, planet_radius, ring_radius = drawn_radii(angles)
-    _body(axes, np.zeros(2), ring, ring_radius, _BODIES["ring"], mark=False)
-    for angle in np.arange(3) * 2 * np.pi / 3 + np.pi / 6:
-        _tick(axes, ring, ring_radius, angle)
-    _carrier(axes, carrier, angles)
-    _body(axes, np.zeros(2), sun, sun_radius, _BODIES["sun"])
-    for angle, (radial, tangential, rotation) in zip(angles, planets, strict=True):
-        outward, along = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
-        move = (*(radial * outward + tangential * along), rotation)
-        _body(axes, _CARRIER * outward, move, planet_radius, _BODIES["planet"], angle)
+    spokes = np.exp(1j * np.asarray(angles))
+    # Points of the complex plane: the centre at rest, its displacement, the radius of the rim, and lines about the centre.
+    bodies = [("ring", 0, ring, ring_radius, [ring_radius * _CIRCLE, *(ring_radius * _MARKS)])]
+    bodies += [("carrier", 0, carrier, _CARRIER, [_CARRIER * spoke * _SPOKE for spoke in spokes])]
+    bodies += [("sun", 0, sun, sun_radius, [sun_radius * _CIRCLE, sun_radius * _SPOKE])]
+    for spoke, (radial, tangential, rotation) in zip(spokes, planets, strict=True):
+        local = (radial + 1j * tangential) * spoke
+        lines = [planet_radius * _CIRCLE, planet_radius * spoke * _SPOKE]
+        bodies.append(("planet", _CARRIER * spoke, (local.real, local.imag, rotation), planet_radius, lines))
+    rest, moved, colours = [], [], []
+    for name, centre, (x, y, rotation), radius, lines in bodies:
+        for line in lines:
+            displaced = centre + x + 1j * y + line * np.exp(1j * rotation / radius)
+            rest.append(np.stack([(centre + line).real, (centre + line).imag], axis=-1))
+            moved.append(np.stack([displaced.real, displaced.imag], axis=-1))
+            colours.append(_BODIES[name])
+    axes.add_collection(LineCollection(rest, colors=FRAME_GREY, **_REST))
+    axes.add_collection(LineCollection(moved, colors=colours, linewidths=1.1))
     axes.set(aspect="equal", xlim=(-1.9, 1.9), ylim=(-1.9, 1.9))
-    axes.axis("off")
-
-
-def _body(
-    axes: Axes,
-    centre: np.ndarray,
-    move: Sequence[float],
-    radius: float,
-    colour: str,
-    angle: float = 0.0,
-    mark: bool = True,
-) -> None:
-    """Draw a disk at ``centre`` displaced by ``move`` (x, y, u), with a radius at ``angle``."""
-    rim = radius * np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE)])
-    axes.plot(*(centre[:, None] + rim), color=FRAME_GREY, linewidth=0.4, linestyle=(0, (3, 2)))
-    moved = centre + np.asarray(move[:2])
-    axes.plot(*(moved[:, None] + rim), color=colour, linewidth=1.1)
-    if mark:
-        turned = angle + move[2] / radius
-        axes.plot(
-            *np.stack([moved, moved + radius * np.array([np.cos(turned), np.sin(turned)])], axis=1),
-            color=colour,
-            linewidth=0.9,
-        )
-
-
-def _tick(axes: Axes, move: Sequence[float], radius: float, angle: float) -> None:
-    """Draw a mark across the rim that shows the rotation of a body with a hidden centre."""
-    turned = angle + move[2] / radius
-    along = np.array([np.cos(turned), np.sin(turned)])
-    ends = np.stack([np.asarray(move[:2]) + r * along for r in (radius, 1.08 * radius)], axis=1)
-    axes.plot(*ends, color=_BODIES["ring"], linewidth=1.1)
-
-
-def _carrier(axes: Axes, move: Sequence[float], angles: Sequence[float]) -> None:
-    """Draw the carrier as a star of arms to its planets."""
-    centre = np.asarray(move[:2])
-    for angle in angles:
-        for start, turned, style in (
-            (np.zeros(2), angle, {"color": FRAME_GREY, "linewidth": 0.4, "linestyle": (0, (3, 2))}),
-            (centre, angle + move[2] / _CARRIER, {"color": _BODIES["carrier"], "linewidth": 1.1}),
-        ):
-            end = start + _CARRIER * np.array([np.cos(turned), np.sin(turned)])
-            axes.plot(*np.stack([start, end], axis=1), **style)

@@ -6,11 +6,10 @@ import textwrap
 
 import numpy as np
 import xarray as xr
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from drivetrain_jax.view import charts
-from drivetrain_jax.view.sheet import Sheet
+from drivetrain_jax.view.sheet import Sheet, widen
 from drivetrain_jax.view.style import LINE_COLOURS, coordinate_text, in_brackets, power_of_ten, state
 
 _FIRST, _MOST_ROWS = 1000, 6
@@ -43,8 +42,13 @@ def plot(dataset: xr.Dataset) -> Figure:
 def _draw_row(row: np.ndarray, part: xr.Dataset, name: str | None) -> None:
     points = part["section"].values
     scale = state(part)[1].get("scale", 1.0) if len(state(part)) > 1 else 1.0
+    first = np.abs(points[:, 0]).max(initial=0.0, where=np.isfinite(points[:, 0]))
+    finite = points[np.isfinite(points).all(axis=1)]
+    # Points that are equal up to rounding are one point; the usual ratio of the components is the ``scale``.
+    spread = np.ptp(finite, axis=0) if len(finite) else np.full(2, np.inf)
+    single = (spread <= _NARROW * first * np.array([1.0, scale])).all()
     for axes, shown in zip(row, (points, points[:_FIRST]), strict=False):
-        size = 14.0 if _is_point(points, scale) else 0.6 if len(shown) > 2 * _FIRST else 1.5
+        size = 14.0 if single else 0.6 if len(shown) > 2 * _FIRST else 1.5
         axes.scatter(shown[:, 0], shown[:, 1], s=size, color=LINE_COLOURS[0], linewidths=0, rasterized=True)
         axes.set_title(f"{len(shown)} strobes", loc="left", size=7.5)
     notes = [coordinate_text(part[name])] if name else []
@@ -55,24 +59,6 @@ def _draw_row(row: np.ndarray, part: xr.Dataset, name: str | None) -> None:
         notes.append(f"distinct points: {part['distinct_points'].item()}")
     notes.append(row[0].get_title("left"))
     row[0].set_title(textwrap.fill("; ".join(notes), _LETTERS // len(row)), loc="left", size=7.5)
-    first = np.nanmax(np.abs(points[:, 0]), initial=0.0)
-    for which, values, least in zip("xy", points.T, (0.0, _LOW * scale * first), strict=True):
-        _widen(row[0], which, values[np.isfinite(values)], least)
-
-
-def _is_point(points: np.ndarray, scale: float) -> bool:
-    """True if all finite points are equal up to rounding; ``scale`` is the usual ratio of the components."""
-    finite = points[np.isfinite(points).all(axis=1)]
-    first, second = np.ptp(finite, axis=0) if len(finite) else (np.inf, np.inf)
-    size = _NARROW * np.abs(finite[:, 0]).max(initial=0.0)
-    return bool(first <= size and second <= scale * size)
-
-
-def _widen(axes: Axes, which: str, values: np.ndarray, least: float) -> None:
-    """Widen the limits so that rounding errors do not fill the panel."""
-    if not values.size:
-        return
-    size = max(_NARROW * np.abs(values).max(), least)
-    if np.ptp(values) < size:
-        middle, half = values.mean(), max(0.05 * np.abs(values).max(), least)
-        axes.set(**{f"{which}lim": (middle - half, middle + half)})
+    # Rounding errors do not fill the panel.
+    widen(row[0], "x", 0.1 * (spread[0] <= _NARROW * first))
+    widen(row[0], "y", 0.1 * single, 2 * _LOW * scale * first)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from drivetrain_jax.view.style import (
     FLAG_COLOURS,
     FRAME_GREY,
     LINE_COLOURS,
+    PENDING_COLOUR,
     axis_label,
     units_of,
     variable_label,
@@ -38,46 +38,32 @@ def plot(dataset: xr.Dataset) -> Figure:
     - one: extremes, period multiple, growth, impact velocity and contact fraction of both flanks along the axis, over bands
       of the regimes;
     - the initial state: basins of the attractors with the share of each;
-    - any other two: the regime and the largest displacement, with a predicted threshold.
+    - any others: the regime and the largest displacement, with a predicted threshold.
 
-    Raises :class:`InputError` for other axes, and if variables are missing.
+    Raises :class:`InputError` if variables are missing.
     """
     names = charts.sweep_axes(dataset)
+    initial = [charts.role(dataset, role) for role in ("initial_displacement", "initial_rate")]
     if not names:
         return _motion(dataset)
     if len(names) == 1 and names != ["point"]:
         return _curves(dataset, names[0])
-    initial = [charts.role(dataset, role) for role in ("initial_displacement", "initial_rate")]
-    if set(names) == set(initial):
-        return _basins(dataset, *initial)
-    if len(names) != 2:
-        raise charts.wrong_axes(dataset, "one or two axes, or none, for a figure of steady states")
-    rows = [(name, [dataset]) for name in charts.require_any(dataset, "regime", "u_max")]
-    return charts.maps(rows, _speed_first(dataset, names)).finish(dataset)
-
-
-def _speed_first(dataset: xr.Dataset, names: list[str]) -> list[str]:
-    """The speed and the other axis: a predicted threshold is a curve over the speed."""
-    return sorted(names, key=lambda name: name != charts.role(dataset, "speed"))
+    return (
+        _basins(dataset, *initial) if set(names) == set(initial) else charts.chart(dataset, fields=["regime", "u_max"])
+    )
 
 
 def _curves(dataset: xr.Dataset, name: str) -> Figure:
     extremes = charts.require_any(dataset, "u_max", "u_min")
-    panels = [extremes, *([key] for key in _CURVES if key in dataset)]
     dots: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 1.8}
-    sheet = charts.stack(dataset, name, panels, height=1.95, **dots)
+    sheet = charts.stack(dataset, name, [extremes, *([key] for key in _CURVES if key in dataset)], **dots)
     first = sheet.axes[0, 0]
-    if "period_multiple" in dataset:
-        # Extremes of motions that are not periodic depend on the time of observation.
-        for key in extremes:
-            values = charts.valid(dataset, key).where(dataset["period_multiple"] == 0)
-            other = dots | {"color": FLAG_COLOURS["non_periodic"], "label": "not periodic"}
-            sheet.add(*(first.plot(dataset[name], values, **other) if bool(values.notnull().any()) else ()))
+    # Extremes of motions that are not periodic depend on the time of observation.
+    for key in extremes if "period_multiple" in dataset else ():
+        values = charts.valid(dataset, key).where(dataset["period_multiple"] == 0)
+        other = dots | {"color": FLAG_COLOURS["non_periodic"], "label": "not periodic"}
+        sheet.add(*(first.plot(dataset[name], values, **other) if bool(values.notnull().any()) else ()))
     sheet.add(*charts.draw_flanks(dataset, first))
-    if "regime" in dataset:
-        for axes in sheet.axes[:, 0]:
-            band = {"alpha": 0.35, "zorder": 0}
-            sheet.add(*charts.draw_strip(axes, charts.valid(dataset, "regime"), name, (0.0, 1.0), **band))
     return sheet.finish(dataset)
 
 
@@ -86,52 +72,41 @@ def _basins(dataset: xr.Dataset, horizontal: str, vertical: str) -> Figure:
     codes, names = _attractors(dataset)
     sheet = Sheet(height=4.6)
     axes = sheet.axes[0, 0]
-    colours = [*ATTRACTOR_COLOURS[: len(names)], FAILED_COLOUR]
-    scale = {"cmap": ListedColormap(colours), "vmin": -0.5, "vmax": len(names) + 0.5}
-    charts.draw_cells(axes, codes, horizontal, vertical, **scale)
-    for k, (colour, label) in enumerate(zip(colours, [*names, "other or failed"], strict=True)):
+    colours = [*ATTRACTOR_COLOURS[: len(names)], FAILED_COLOUR, PENDING_COLOUR]
+    scale = {"cmap": ListedColormap(colours), "vmin": -0.5, "vmax": len(names) + 1.5}
+    charts.draw_cells(axes, codes.drop_vars(charts.PENDING, errors="ignore"), horizontal, vertical, **scale)
+    for k, (colour, label) in enumerate(zip(colours, [*names, "other or failed", charts.PENDING], strict=True)):
         share = float((codes == k).mean())
         patch = Patch(facecolor=colour, edgecolor=FRAME_GREY, linewidth=0.6, label=f"{label}: {share:.1%}")
         sheet.add(*([patch] if share > 0 else []))
-    axes.set_box_aspect(1)
     sheet.label(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
     return sheet.finish(dataset)
 
 
 def _attractors(dataset: xr.Dataset) -> tuple[xr.DataArray, list[str]]:
-    """The attractors by falling share: the number of each point's attractor, and its properties."""
+    """The number of each point's attractor, by falling share, with the properties of the attractors; one more for other or
+    failed points, two more for pending ones."""
     known = (dataset["outcome"] < FIRST_FAILURE).values
-    multiple, high = dataset["period_multiple"].values, dataset["u_max"].values
-    units = units_of(dataset["u_max"])
+    multiple, high = (dataset[name].values[known] for name in ("period_multiple", "u_max"))
     # All non-periodic motions count as one attractor.
-    level = np.where(multiple > 0, np.log(np.abs(np.where(known, high, 1.0)) + 1e-300) / _SAME, 0.0)
-    keys = [(int(m), round(float(x))) for m, x in zip(multiple[known], level[known], strict=True)]
-    merged = _merge(keys)
-    kinds, counts = np.unique(merged, return_counts=True)
-    kinds = kinds[np.argsort(-counts)][: len(ATTRACTOR_COLOURS)]
-    codes = np.full(known.shape, len(kinds))
-    flat = np.full(len(merged), len(kinds))
-    names = []
-    for number, kind in enumerate(kinds):
-        flat[merged == kind] = number
-        first = int(np.flatnonzero(merged == kind)[0])
-        m = keys[first][0]
-        size = high[known][first]
-        names.append(f"period {m}, largest u {size:.4g} {units}".rstrip() if m else "non-periodic")
-    codes[known] = flat
+    level = np.where(multiple > 0, np.log(np.abs(high) + 1e-300) / _SAME, 0.0)
+    # Motions of one period whose sizes form a chain of neighbours are one attractor.
+    order = np.lexsort((level, multiple))
+    first = np.append(True, (np.diff(multiple[order]) != 0) | (np.diff(level[order]) > 1))[: order.size]
+    kind = np.empty(order.size, int)
+    kind[order] = np.cumsum(first) - 1
+    shown = np.argsort(-np.bincount(kind), kind="stable")[: len(ATTRACTOR_COLOURS)]
+    numbers = np.full(kind.max(initial=-1) + 1, len(shown))
+    numbers[shown] = np.arange(len(shown))
+    examples, units = order[first][shown], units_of(dataset["u_max"])
+    names = [
+        f"period {m}, largest u {size:.4g} {units}".removesuffix(" 1") if m else "non-periodic"
+        for m, size in zip(multiple[examples], high[examples], strict=True)
+    ]
+    codes = np.full(known.shape, len(names))
+    codes[known] = numbers[kind]
+    codes[dataset.get(charts.PENDING, known & False)] = len(names) + 1
     return dataset["outcome"].copy(data=codes), names
-
-
-def _merge(keys: list[tuple[int, int]]) -> np.ndarray:
-    """Numbers of classes of ``(multiple, level)`` whose levels form chains of neighbours."""
-    order = sorted(range(len(keys)), key=keys.__getitem__)
-    numbers = np.zeros(len(keys), int)
-    current = 0
-    for before, here in itertools.pairwise(order):
-        near = keys[before][0] == keys[here][0] and keys[here][1] - keys[before][1] <= 1
-        current += not near
-        numbers[here] = current
-    return numbers
 
 
 def _motion(dataset: xr.Dataset) -> Figure:
