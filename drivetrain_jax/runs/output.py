@@ -60,9 +60,7 @@ class Output:
         if self.out.exists() and not self.out.is_dir() and not (self.out.is_file() and self.store == HDF5):
             what = "is a file; allowed for store = 'zarr' is a new path, or such a store"
             raise self._error(what if self.store == ZARR else "not a regular file; allowed is the path of a file")
-        # Attributes and digest of the present result: None without one, empty if the metadata of a store are damaged.
-        self.attrs = self._attributes()
-        self.present = None if self.attrs is None else self.attrs.get("digest", "")
+        self.present = self._digest()
 
     def _error(self, text: str) -> InputError:
         return InputError(f"out = {str(self.out)!r}: {text}")
@@ -85,20 +83,26 @@ class Output:
             if folder.exists() and not os.access(folder, os.W_OK | os.X_OK):
                 raise self._error(f"the folder {str(folder)!r} is not writable; allowed is a file in a writable folder")
 
-    def _attributes(self) -> Mapping[str, Any] | None:
-        """Attributes of the present result; None without one."""
+    def _digest(self) -> str | None:
+        """Digest of the present result; None without one, empty if the metadata of a store are damaged."""
         if not self.out.exists():
             return None
         allowed = "allowed is a new file or a result of drivetrain_jax"
         try:
-            found = (zarr_store.attributes if self.store == ZARR else consolidate.read_attributes)(self.out)
+            found = self.attribute("digest")
         except InputError:
             if self.store == HDF5:
                 raise self._error(f"not a readable netCDF4/HDF5 file; {allowed}") from None
-            return {}
-        if not isinstance(found.get("digest"), str):
+            return ""
+        if not isinstance(found, str):
             raise self._error(f"not a result of drivetrain_jax; {allowed}")
         return found
+
+    def attribute(self, name: str) -> Any:
+        """A global attribute of the present result."""
+        if self.store == ZARR:
+            return zarr_store.attributes(self.out).get(name)
+        return consolidate.read_attribute(self.out, name)
 
     def discard(self) -> None:
         """Delete the remains of the run that made the present result, if it was killed before it could delete them.
@@ -156,8 +160,7 @@ class Output:
 
     def check_unchanged(self) -> None:
         """Raise :class:`InputError` if another run has finished or started since this object was created."""
-        now = self._attributes()
-        if (None if now is None else now.get("digest", ""), self.parts.plan()) != (self.present, self.unfinished):
+        if (self._digest(), self.parts.plan()) != (self.present, self.unfinished):
             raise self._error("another run has changed it; run the command again")
 
     @cached_property
@@ -252,11 +255,14 @@ class Output:
         what = self._damage or (self._found.what if isinstance(self._found, Damaged) else "")
         if what:
             return f"a damaged result ({what})"
-        stored, what = self.unfinished or self.attrs or {}, "unfinished work" if self.unfinished else "a result"
+        stored, what = self.unfinished, "unfinished work" if self.unfinished else "a result"
         if self.unfinished and self.present not in (None, stored.get("replaces")):
             return f"{what} that was started for another result"
         if self.unfinished and self.store != stored.get("store"):
             return f"{what} of --store {stored.get('store')}"
+        if not stored:
+            names = ("scene", "drivetrain_jax_version", "numerics", "numerics_detail")
+            stored = {name: self.attribute(name) for name in names}
         reasons = differences(stored, self.job)
         more = f" and {len(reasons) - 2} more" if len(reasons) > 2 else ""
         return f"{what} of another scene or version: {'; '.join(reasons[:2]) or 'other sizes of chunks'}{more}"
@@ -265,8 +271,8 @@ class Output:
         """Number of points of the complete result, and their outcomes; of an atlas its solves, which have no outcomes."""
         if self.job.scene.analysis.continuous:
             try:
-                return int((self.attrs or {})["solves"]), np.empty(0, OUTCOME.dtype)
-            except (KeyError, TypeError, ValueError):
+                return int(self.attribute("solves")), np.empty(0, OUTCOME.dtype)
+            except (TypeError, ValueError):
                 raise self._error("no atlas has these attributes; --fresh replaces it") from None
         read = zarr_store.read_variable if self.store == ZARR else consolidate.read_variable
         return self.job.total, read(self.out, OUTCOME.name)

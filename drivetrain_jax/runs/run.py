@@ -88,8 +88,8 @@ def run(
     with shown_progress(report) as show:
         if out is None:
             return _in_memory(_job(scene, overrides, on_disk=False), executor, show)
-        more: dict[str, Any] = {"executor": executor, "reuse": reuse, "report": show}
-        run_to_file(scene, Path(out), overrides=overrides, fresh=fresh, store="hdf5", **more)
+        how: dict[str, Any] = {"fresh": fresh, "executor": executor, "reuse": reuse, "report": show}
+        run_to_file(scene, Path(out), overrides=overrides, store=HDF5, **how)
     return open_result(Path(out))
 
 

@@ -318,15 +318,14 @@ def axes_of(
         raise InputError("points: given together with axes; allowed is one of the two")
     if analysis.continuous:
         _check_ranges(axes, points, analysis)
-    for where, name in [("axes", n) for n in axes] + [("points", n) for n in points]:
-        parameter, _ = _swept_parameter(system, where, name)
-        if analysis.continuous and parameter.integer:
-            raise InputError(
-                f"axes.{name}: an integer; allowed for {analysis.name} are parameters with a continuous range"
-            )
+    swept = {name: _swept_parameter(system, "points" if points else "axes", name) for name in axes or points}
     if points:
-        return _points(points, system), True
-    specs = {name: _axis_table(system, name, value) for name, value in axes.items()}
+        return _points(points, system, swept), True
+    for name, parameter in swept.items():
+        if analysis.continuous and parameter.integer:
+            allowed = f"allowed for {analysis.name} are parameters with a continuous range"
+            raise InputError(f"axes.{name}: an integer; {allowed}")
+    specs = {name: _axis_table(system, swept[name], name, value) for name, value in axes.items()}
     counts = {name: check_count(name, spec, analysis.continuous) for name, (spec, _) in specs.items()}
     total = math.prod(counts.values())
     if total > MAX_POINTS:
@@ -335,7 +334,7 @@ def axes_of(
     if most * _BYTES > present:
         name = max(counts, key=lambda name: counts[name])
         raise InputError(f"axes.{name}.num = {most}: allowed with this memory is up to {int(present / _BYTES)}")
-    return tuple(_axis(system, name, *spec) for name, spec in specs.items()), False
+    return tuple(_axis(name, *spec) for name, spec in specs.items()), False
 
 
 def _check_ranges(axes: Mapping[str, Any], points: Mapping[str, Any], analysis: Analysis) -> None:
@@ -345,7 +344,7 @@ def _check_ranges(axes: Mapping[str, Any], points: Mapping[str, Any], analysis: 
         raise InputError(f"axes: {len(axes)} are given; {analysis.name} allows 1 to {MAX_RANGES}")
 
 
-def _axis_table(system: type[System], name: str, given: Any) -> tuple[AxisTable, Parameter]:
+def _axis_table(system: type[System], parameter: Parameter, name: str, given: Any) -> tuple[AxisTable, Parameter]:
     """The keys of an axis with numbers for texts, and the range of a value in their unit."""
     if isinstance(given, list):
         given = {"values": given}
@@ -355,29 +354,26 @@ def _axis_table(system: type[System], name: str, given: Any) -> tuple[AxisTable,
     if isinstance(num := given.get("num"), float) and num.is_integer():
         # Options and parameters also accept 1e3 for 1000.
         given = {**given, "num": int(num)}
-    parameter, _ = _swept_parameter(system, "axes", name)
     spec = toml.converted(given, WrittenAxis, f"axes.{name}.")
-    return in_units(spec, _scalar(parameter, name), keep=_is_physical(system, name))
+    return in_units(spec, parameter, keep=_is_physical(system, name))
 
 
 def _is_physical(system: type[System], name: str) -> bool:
     return system.physical is not None and entry_of(name)[0] in system.physical.names
 
 
-def _axis(system: type[System], name: str, spec: AxisTable, scalar: Parameter) -> Axis:
-    _, entry = _swept_parameter(system, "axes", name)
+def _axis(name: str, spec: AxisTable, scalar: Parameter) -> Axis:
+    base, entry = entry_of(name)
     for value in spec.values if spec.values is not None else (spec.start, spec.stop):
         checked(scalar, value, "axes.")
     values = spread(spec, f"axes.{name}")
     if scalar.integer:
         for value in values:
             checked(scalar, float(value), "axes.")
-    return Axis(
-        name, replace(scalar, name=entry_of(name)[0]), entry, values.astype(np.int64) if scalar.integer else values
-    )
+    return Axis(name, replace(scalar, name=base), entry, values.astype(np.int64) if scalar.integer else values)
 
 
-def _points(points: Mapping[str, Any], system: type[System]) -> tuple[Axis, ...]:
+def _points(points: Mapping[str, Any], system: type[System], swept: Mapping[str, Parameter]) -> tuple[Axis, ...]:
     """Columns of parameter values of equal length."""
     for name, values in points.items():
         if not isinstance(values, list):
@@ -388,23 +384,16 @@ def _points(points: Mapping[str, Any], system: type[System]) -> tuple[Axis, ...]
         raise InputError(f"points: {listed}; allowed are lists of one length, at least 1")
     columns = []
     for name, values in points.items():
-        parameter, entry = _swept_parameter(system, "points", name)
-        scalar = _scalar(parameter, name)
         for value in values:
-            checked(scalar, value, "points.")
-        spec, scalar = in_units(WrittenAxis(values=values), scalar, keep=_is_physical(system, name))
-        numbers = np.array(spec.values, np.int64 if parameter.integer else float)
-        columns.append(Axis(name, replace(scalar, name=parameter.name), entry, numbers))
+            checked(swept[name], value, "points.")
+        spec, scalar = in_units(WrittenAxis(values=values), swept[name], keep=_is_physical(system, name))
+        numbers, (base, entry) = np.array(spec.values, np.int64 if scalar.integer else float), entry_of(name)
+        columns.append(Axis(name, replace(scalar, name=base), entry, numbers))
     return tuple(columns)
 
 
-def _scalar(parameter: Parameter, name: str) -> Parameter:
-    """The range of one number of ``parameter``, under the name of its axis."""
-    return replace(parameter, name=name, listed=False, broadcast=False)
-
-
-def _swept_parameter(system: type[System], where: str, name: str) -> tuple[Parameter, int | None]:
-    """The parameter of the axis ``name``, and the position of a list entry."""
+def _swept_parameter(system: type[System], where: str, name: str) -> Parameter:
+    """The range of one number of the axis ``name``, under that name."""
     base, entry = entry_of(name)
     parameter = described(system).get(base)
     if parameter is None:
@@ -417,7 +406,7 @@ def _swept_parameter(system: type[System], where: str, name: str) -> tuple[Param
         )
     if entry is not None and not parameter.listed:
         raise InputError(f"{where}.{name}: {base} is not a list; allowed is {base}")
-    return parameter, entry
+    return replace(parameter, name=name, listed=False, broadcast=False)
 
 
 def unknown_parameter(system: type[System], name: str) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax.analysis import OUTCOME
-from drivetrain_jax.runs.assemble import PENDING, labelled, missing_value, template, with_pending
+from drivetrain_jax.runs.assemble import PENDING, labelled, missing_value, sweep_first, template, with_pending
 from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.job import Block, Job, Results
 from drivetrain_jax.runs.scene import restore_scene, result_variables
@@ -55,12 +55,13 @@ def stored_blocks(
     numbers, variables = set(store.numbers()), result_variables(job.problem)
     kinds = {v.name: (v.dtype, 1 + (job.grid.path is not None) + len(v.dims)) for v in variables}
     for block in job.blocks(points) if numbers else ():
-        if first + block.number in numbers and block.number not in without:
-            found = store.read(first + block.number) or {}
-            if {name: (str(values.dtype), values.ndim) for name, values in found.items()} == kinds and {
-                *map(len, found.values())
-            } == {len(job.points(block))}:
-                yield block, found
+        if first + block.number not in numbers or block.number in without:
+            continue
+        found, count = store.read(first + block.number) or {}, len(job.points(block))
+        if {n: (str(x.dtype), x.ndim) for n, x in found.items()} == kinds and {len(x) for x in found.values()} == {
+            count
+        }:
+            yield block, found
 
 
 @dataclass(frozen=True)
@@ -116,12 +117,9 @@ class ZarrBlocks:
         grid, found = self.job.grid, zarr_store.read(Path(self.place), self.job.boxes, number)
         if found is None:
             return None
-        rows = {}
-        for name, values in found.items():
-            moved = values if grid.path_position is None else np.moveaxis(values, grid.path_position, len(grid.shape))
-            moved = moved.reshape(-1, *moved.shape[len(grid.shape) :])
-            rows[name] = moved[:, None] if grid.path_is_fixed else moved
-        return rows
+        moved = {name: sweep_first(values, grid) for name, values in found.items()}
+        rows = {name: values.reshape(-1, *values.shape[len(grid.shape) :]) for name, values in moved.items()}
+        return {name: values[:, None] if grid.path_is_fixed else values for name, values in rows.items()}
 
     def finish(self, parts: PartsFolder, **attrs: str | float) -> None:
         """Move the store into place. A former one is moved away first, because a folder cannot be replaced in one step.

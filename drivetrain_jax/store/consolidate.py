@@ -122,8 +122,10 @@ def read_attributes(path: Path) -> dict[str, Any]:
 
 
 def read_attribute(path: Path, name: str) -> Any:
-    """An attribute of :func:`read_attributes`; None if it is missing."""
-    return read_attributes(path).get(name)
+    """One of :func:`read_attributes`, None if it is missing, without reading the others."""
+    with opened(path) as file:
+        holds = file[GROUP] if name not in file.attrs and GROUP in file else file
+        return _plain(holds.attrs.get(name))
 
 
 def layout(path: Path) -> dict[str, tuple[np.dtype, tuple[int, ...]]]:
