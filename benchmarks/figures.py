@@ -29,7 +29,7 @@ def draw_precision(rungs: pd.DataFrame, facts: Mapping[str, str], path: Path) ->
     regions, methods = list(dict.fromkeys(rungs.region)), list(dict.fromkeys(rungs.method))
     columns = min(COLUMNS, len(regions))
     rows = math.ceil(len(regions) / columns)
-    figure = Figure(figsize=(3.3 * columns, 2.9 * rows + 1.1), layout="constrained", dpi=120)
+    figure = Figure(figsize=(max(3.3 * columns, 9.0), 2.9 * rows + 1.1), layout="constrained", dpi=120)
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for ax, region in zip(axes.flat, regions, strict=False):
         for number, method in enumerate(methods):
@@ -43,13 +43,13 @@ def draw_precision(rungs: pd.DataFrame, facts: Mapping[str, str], path: Path) ->
         ax.set_visible(False)
     for ax in axes.flat[max(len(regions) - columns, 0) : len(regions)]:
         ax.tick_params(labelbottom=True)
-    figure.supxlabel("largest relative error", fontsize=10)
+        ax.set_xlabel("largest relative error")
     figure.supylabel("time per point / s", fontsize=10)
     handles = [Line2D([], [], label=method, **_style(i)) for i, method in enumerate(methods)]
     hollow = Line2D([], [], ls="none", marker="o", ms=7, mfc="white", mec="black", label="points failed")
     about = "; ".join(facts.get(name, "") for name in ("machine", "versions", "date"))
     figure.legend(
-        handles=[*handles, hollow], loc="outside lower center", ncols=min(5, columns + 1), frameon=False, fontsize=8.5,
+        handles=[*handles, hollow], loc="outside lower center", ncols=min(5, columns + 2), frameon=False, fontsize=8.5,
         title=about, title_fontsize=6.5,
     )  # fmt: skip
     figure.savefig(path)
