@@ -153,3 +153,13 @@ def pytest_runtest_teardown(item, nextitem):
             jax.clear_caches()
             gc.collect()
             trim()
+
+
+@pytest.fixture
+def retraced():
+    """Traces anew, in this test and after it, what depends on a constant that the test changes."""
+    from drivetrain_jax.analysis.numerics import lanes
+
+    lanes._trace.cache_clear()
+    yield
+    lanes._trace.cache_clear()

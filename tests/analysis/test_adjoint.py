@@ -25,7 +25,7 @@ def gradients(build, values, steps, weights):
 
 
 @pytest.mark.full
-def test_two_levels_of_kept_states_give_what_one_gives(monkeypatch):
+def test_two_levels_of_kept_states_give_what_one_gives(monkeypatch, retraced):
     """Nine panels; with three states on a level they become three times three."""
     build = get_system("cardan").models["floquet"].build
     weights = jnp.asarray(np.random.default_rng(0).normal(size=(2, 4, 4)))

@@ -434,6 +434,11 @@ def test_gradients_at_extremes(point):
         assert gradient[name] == pytest.approx(difference, rel=1e-5, abs=noise), name
 
 
+def test_a_gradient_that_needs_too_many_panels_has_no_value():
+    point = {"beta": 1.2, "Omega": 5e-5, "zeta": 1e-4, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+    assert atlas_answers.radius_gradient(CARDAN, point) is None
+
+
 @pytest.mark.full
 def test_steps_of_a_gradient_are_found_where_the_system_predicts_none():
     model = CARDAN.models["floquet"]

@@ -59,7 +59,7 @@ COUNTS = {
     "operations cardan": 8226,
     # 200 of those of bicardan are segments without mass: which shafts are undefined, and the number of modes.
     "operations bicardan": 1059,
-    "operations rattle": 4424,
+    "operations rattle": 4891,
     # Steps that the plan predicts for the 1,550 cells of the chart, padding included.
     "predicted panels cardan": 59_904,
     # One panel, whose nodes come from power series. It is near the limit of rounding, so slightly worse nodes would be

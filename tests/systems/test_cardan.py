@@ -308,7 +308,7 @@ def test_systems_are_found_by_name():
 
 @pytest.mark.full
 @pytest.mark.parametrize("rtol", [1e-10, 1e-7])
-def test_predicted_panels_are_enough_and_not_many_more(rtol, monkeypatch):
+def test_predicted_panels_are_enough_and_not_many_more(rtol, monkeypatch, retraced):
     """Too few panels repeat a block of lanes with twice as many."""
     monkeypatch.setattr(propagator, "_MAX_REFINEMENTS", 0)
     rng, count = np.random.default_rng(3), 500

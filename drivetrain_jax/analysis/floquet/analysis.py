@@ -20,7 +20,7 @@ from jax import Array
 from drivetrain_jax._quantities import Dimension, Parameter
 from drivetrain_jax.analysis._base import DIFFRAX_SOLVERS, RTOL, Analysis, Request, Solver
 from drivetrain_jax.analysis.floquet.direct_solvers import direct_solvers
-from drivetrain_jax.analysis.floquet.effort import traced_panels
+from drivetrain_jax.analysis.floquet.effort import MAX_PANELS, traced_panels
 from drivetrain_jax.analysis.floquet.results import VARIABLES, lacks, results
 from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.systems import System
@@ -56,7 +56,7 @@ _DERIVATIVES = 1e-13
 def _derivatives(
     system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Jacobians of multipliers, exponents and spectral radius; NaN where multipliers coalesce.
+    """Jacobians of multipliers, exponents and spectral radius; NaN where multipliers coalesce or need too many panels.
 
     ``results`` are not used, so a gradient alone computes no values.
     """
@@ -65,8 +65,9 @@ def _derivatives(
 
     build = system.models["floquet"].build
     panels = traced_panels(build, eqx.combine(parameters, constants.tree), _DERIVATIVES)
-    z, log_scale, pull = monodromy(build, parameters, constants, panels)
-    sigma, by_entry, error = multipliers(z)
+    resolved = panels < MAX_PANELS
+    z, log_scale, pull = monodromy(build, parameters, constants, jnp.where(resolved, panels, 2))
+    sigma, by_entry, error = multipliers(jnp.where(resolved, z, jnp.nan))
     scale, n = jnp.exp(log_scale), len(sigma)
     unit = sigma / jnp.abs(sigma)
     # A radius that underflows has no derivative either.

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from math import isqrt
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -26,14 +27,15 @@ import jax.numpy as jnp
 from jax import Array
 
 from drivetrain_jax.analysis.floquet.direct import assemble
+from drivetrain_jax.analysis.floquet.effort import MAX_PANELS
 from drivetrain_jax.analysis.floquet.multipliers import sort_multipliers
 from drivetrain_jax.analysis.floquet.propagator import Panels
 from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, matmul
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
-# States kept on each of two levels, 130,000 panels in all, and lanes per block.
-_KEPT, _LANES = 360, 32
+# States kept on each of two levels, enough for the most panels, and lanes per block.
+_KEPT, _LANES = 1 + isqrt(MAX_PANELS), 32
 
 Build = Callable[[Any], FloquetModel]
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
 # Most panels and most steps of a point; with more, it ends as STEP_LIMIT.
-_MAX_PANELS, MAX_STEPS = 400_000, 1_000_000
+MAX_PANELS, MAX_STEPS = 400_000, 1_000_000
 # Panels of a model that is NaN somewhere in its span: it is solved all the same, so that its outcome becomes NOT_FINITE.
 _TO_FIND_NO_VALUE = 16
 # Steps of order 8 as accurate as one panel, and the decay in a step with which explicit schemes are stable.
@@ -36,7 +36,7 @@ def panels_needed(system: type[System], columns: Mapping[str, Any], rtol: float)
     else:
         panels = _panels_of(_frequency_phase(build, columns), predicted(_decay, (build,), columns), rtol)
     panels = np.where(np.isnan(panels), _TO_FIND_NO_VALUE, panels)
-    return np.broadcast_to(np.where(panels <= _MAX_PANELS, np.ceil(panels), np.inf), count_of(columns))
+    return np.broadcast_to(np.where(panels <= MAX_PANELS, np.ceil(panels), np.inf), count_of(columns))
 
 
 def strongly_damped(system: type[System], columns: Mapping[str, Any]) -> np.ndarray | bool:
@@ -55,7 +55,7 @@ def traced_panels(build: Build, values: Mapping[str, Any], rtol: float) -> Array
         need = lambda own: _panels_of(*_estimate(build, eqx.combine(own, rest)), rtol)  # noqa: E731
         panels = jax.vmap(need)(arrays) if jax.tree.leaves(arrays) else need(arrays)
     panels = jnp.ceil(jnp.where(jnp.isnan(panels), _TO_FIND_NO_VALUE, panels))
-    return jnp.clip(panels, 2, _MAX_PANELS).astype(jnp.int64)
+    return jnp.clip(panels, 2, MAX_PANELS).astype(jnp.int64)
 
 
 def steps_needed(system: type[System], columns: Mapping[str, Any], rtol: float) -> np.ndarray:
