@@ -217,9 +217,12 @@ def test_steps_follow_the_field(hard):
     exact = dt.run(scene | {"fixed": {"element": "input", "beta": 0.157, "chi_n": 0.01}})
     assert (exact.outcome == Outcome.SUCCESS).all() and (ours.outcome == Outcome.SUCCESS).all()
     found, expected = ours.lyapunov_spectrum.values, exact.floquet_exponent.values
-    np.testing.assert_allclose(found.sum(axis=1), expected.sum(axis=1), rtol=5e-5)
+    # Multipliers far below the largest are not known.
+    known = np.isfinite(expected)
+    assert known.sum() >= 13
+    np.testing.assert_allclose(found.sum(axis=1)[known.all(axis=1)], expected.sum(axis=1)[known.all(axis=1)], rtol=5e-5)
     error = ours.lyapunov_standard_error.values
-    assert (np.abs(found - expected) < 3 * error + 5e-5 * np.abs(expected)).all()
+    assert (np.abs(found - expected) < 3 * error + 5e-5 * np.abs(expected))[known].all()
     assert np.isin(ours.verdict, [Verdict.FIXED_POINT, Verdict.PERIODIC, Verdict.QUASI_PERIODIC]).all()
     assert not broken(ours)
 

@@ -51,12 +51,14 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
 
 # Target of the predicted panels of derivatives, tight because derivatives lose some digits against multipliers.
 _DERIVATIVES = 1e-13
+# Relative error of the monodromy matrix from which on its derivatives have no value.
+_RESOLVED = 1e-6
 
 
 def _derivatives(
     system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Jacobians of multipliers, exponents and spectral radius; NaN where multipliers coalesce or need too many panels.
+    """Jacobians of multipliers, exponents and spectral radius; NaN where multipliers coalesce or panels are too few.
 
     ``results`` are not used, so a gradient alone computes no values.
     """
@@ -65,9 +67,9 @@ def _derivatives(
 
     build = system.models["floquet"].build
     panels = traced_panels(build, eqx.combine(parameters, constants.tree), _DERIVATIVES)
-    resolved = panels < MAX_PANELS
-    z, log_scale, pull = monodromy(build, parameters, constants, jnp.where(resolved, panels, 2))
-    sigma, by_entry, error = multipliers(jnp.where(resolved, z, jnp.nan))
+    # Where no number would do, two panels show it soonest.
+    z, log_scale, error, pull = monodromy(build, parameters, constants, jnp.where(panels < MAX_PANELS, panels, 2))
+    sigma, by_entry, error = multipliers(jnp.where(error < _RESOLVED, z, jnp.nan), error)
     scale, n = jnp.exp(log_scale), len(sigma)
     unit = sigma / jnp.abs(sigma)
     # A radius that underflows has no derivative either.
