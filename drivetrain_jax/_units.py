@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import suppress
 from functools import cache, lru_cache
 from typing import Any
 
@@ -72,7 +73,8 @@ def misread(text: str) -> str:
     if re.match(r"[+-]?[1-9]\d{0,2}(,\d{3}){2,}(?![\d,])", plain):
         return " (write digits without commas)"
     if quotient := re.fullmatch(r"([\d.]+)/([\d.]+)", plain):
-        return f" (a quotient is written as a number: {float(quotient[1]) / float(quotient[2]):.10g})"
+        with suppress(ValueError, ZeroDivisionError):
+            return f" (a quotient is written as a number: {float(quotient[1]) / float(quotient[2]):.10g})"
     return " (a range, where one number is needed)" if re.fullmatch(r"[^:]+:[^:]+", plain) else ""
 
 

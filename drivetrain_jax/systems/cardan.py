@@ -87,9 +87,9 @@ def panels_needed(xp: Any, phase: Any, sharpness: Any, decay: Any, digits: float
     """Panels of Gauss collocation over half a period; fitted, see ``Cardan.panels``."""
     x, y, z = xp.log(xp.maximum(phase, 1.0)), sharpness, xp.log(xp.maximum(decay, 1.0))
     # For long oscillations the error is phase (phase/n)^10 in n panels.
-    short = xp.minimum(x, 3.2)
-    light = 0.78 + (0.315 + 0.136 * short) * short + 1.1 * (x - short) + 0.2 * digits
-    light = light + (0.5 - 0.128 * xp.minimum(x, 4.0) + 0.022 * digits) * y
+    short = xp.minimum(x, 4.0)
+    light = 0.78 + 0.315 * short + 0.136 * short**2 + (0.5 - 0.128 * short + 0.022 * digits) * y + 0.2 * digits
+    light = light + 1.1 * (x - short)
     heavy = 1.08 + (0.278 + 0.062 * x) * x + 0.413 * y + (0.201 + 0.02 * z - 0.051 * y - 0.062 * x) * z + 0.182 * digits
     faded = xp.maximum(heavy, light - xp.maximum(decay - 6.0, 0.0) / 16)
     return xp.exp(xp.where(decay > 3, faded, light))

@@ -136,6 +136,8 @@ GUESSES = [
     (POINT.replace("beta=0.3", "beta=17,2deg"), "did you mean 17.2?"),
     (POINT.replace("beta=0.3", "beta=0.1:0.3"), "a range, where one number is needed"),
     (POINT.replace("mu=1", "mu=1/2"), "a quotient is written as a number: 0.5"),
+    (POINT.replace("mu=1", "mu=0/0"), "mu = '0/0': "),
+    (POINT.replace("mu=1", "mu=1.2.3/4"), "mu = '1.2.3/4': "),
     (POINT.replace("mu=1", "mu=inf"), "mu = inf: allowed is 0 < mu < inf"),
     (POINT.replace("zeta=0.001", "damping=0.001"), "did you mean c1 or c2 or zeta or alpha?"),
     (f"{POINT} tol=1e-6", "did you mean rtol?"),
