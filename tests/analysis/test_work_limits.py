@@ -98,6 +98,6 @@ def test_a_usual_point_beyond_a_small_limit_is_not_finished(name, monkeypatch):
 @pytest.mark.full
 def test_a_search_for_an_orbit_ends_at_its_limit(monkeypatch):
     monkeypatch.setattr("drivetrain_jax.analysis.forced.orbit.MAX_SEARCH", 1)
-    monkeypatch.setattr("drivetrain_jax.analysis.forced.analysis._others", lambda *_: jnp.zeros((0, 4)))
+    monkeypatch.setattr("drivetrain_jax.analysis.forced.analysis._others", lambda *_: jnp.full((1, 4), jnp.nan))
     found = dt.forced(dt.Cardan(**JOINT), outputs=["orbit_state"], rtol=4.17e-8)
     assert found.outcome == Outcome.NOT_CONVERGED
