@@ -57,7 +57,7 @@ def _propagator_solvers(system: type[System], request: Request) -> tuple[Solver,
         rtol,
         rtol,
         lambda model: whole_span(model.reduced),
-        lambda model, phi: _results(phi, request.outputs),
+        lambda model, phi, _: _results(phi, request.outputs),
         _CHUNK,
     )
 

@@ -35,7 +35,7 @@ def _direct_solvers(system: type[System], request: Request) -> tuple[Solver, ...
         rtol,
         rtol / 4,
         lambda model: model.direct,
-        lambda model, z: results(z, request.outputs, rtol, model),
+        lambda model, z, factors: results(z, request.outputs, rtol, model, factors=factors),
         damped=True,
     )
 

@@ -11,19 +11,22 @@ from jax import Array
 
 from drivetrain_jax.analysis._base import Solver
 from drivetrain_jax.analysis.floquet.direct import Monodromy
-from drivetrain_jax.analysis.floquet.effort import panels_needed, strongly_damped, traced_panels
+from drivetrain_jax.analysis.floquet.effort import fastest_rate, panels_needed, strongly_damped, traced_panels
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.systems import System
 
 if TYPE_CHECKING:
+    from drivetrain_jax.analysis.floquet.propagator import Factored
     from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
 # Ratio of the panels of the two solutions behind an error estimate, and the loosest target for it. The ratio needs a system
 # that predicts its panels: elsewhere so few panels may not show the order of the scheme.
 _RATIO, _FINE = 4, 1e-8
+# Most panels for small multipliers.
+_MOST_FACTORS = 4096
 
 Form = Callable[["FloquetModel"], "LinearPeriodic"]
-Results = Callable[["FloquetModel", Monodromy], dict[str, Array]]
+Results = Callable[["FloquetModel", Monodromy, Callable[[], "Factored"]], dict[str, Array]]
 
 
 def direct_solvers(
@@ -35,7 +38,7 @@ def direct_solvers(
     chunk: int = 512,
     damped: bool = False,
 ) -> tuple[Solver, ...]:
-    """The solvers that return ``results(model, monodromy)`` from the monodromy matrix of ``form(model)``.
+    """The solvers that return ``results(model, monodromy, factors)`` from the monodromy matrix of ``form(model)``.
 
     ``rtol`` predicts the effort; every point is refined to the error ``target``. With ``damped`` a second solver takes the
     points with strong damping, in the model's form for them.
@@ -45,7 +48,7 @@ def direct_solvers(
     def solver(name: str, form: Form, effort: Callable[[Mapping[str, Any]], np.ndarray]) -> Solver:
         def solve(values: Mapping[str, Any], panels: Array) -> dict[str, Array]:
             # Local import: diffrax takes as long as jax, and only tracing needs it.
-            from drivetrain_jax.analysis.floquet.propagator import monodromy
+            from drivetrain_jax.analysis.floquet.propagator import factored, monodromy
 
             model = build(values)
             ratio = jnp.where(target <= _FINE, _RATIO, 2) if model.panels is not None else 2
@@ -53,7 +56,12 @@ def direct_solvers(
             def one(own: Mapping[str, Any], panels: Array) -> Monodromy:
                 return monodromy(form(build(own)), panels, target, ratio)
 
-            return results(model, over_lanes(one)(values, panels))
+            def factors() -> Factored:
+                # Gauss schemes need panels in proportion to fast decays and growths.
+                count = jnp.maximum(panels, jnp.minimum(fastest_rate(form(model)), _MOST_FACTORS).astype(int))
+                return over_lanes(lambda own, count: factored(form(build(own)), count))(values, count)
+
+            return results(model, over_lanes(one)(values, panels), factors)
 
         return Solver(
             f"direct: Gauss collocation of order 10{name}",

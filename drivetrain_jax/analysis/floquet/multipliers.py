@@ -22,19 +22,27 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import reduce
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.numerics.linear_algebra import matmul, square_sum
+from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, matmul, square_sum
+
+if TYPE_CHECKING:
+    from drivetrain_jax.analysis.floquet.propagator import Factored
 
 VERDICTS = ("stable", "unstable", "undecided")
 
 # Radii of the circles relative to the spectral radius: four per decade from 10 down to rounding, 1 % below powers of ten so
 # that a bound can meet a decimal tolerance.
 _LARGEST, _STEP, _COUNT = 9.9, 10**-0.25, 69
+# Ratio of moduli below which multipliers belong to different blocks, and roundings of a factor in units of eps.
+_APART, _ROUNDINGS = 1e-6, 16.0
+# Size of rounding in the coupling of blocks that have converged, and a margin for their coupling three periods before.
+_SEPARATE, _COUPLING = 1e-12, 1e6
 
 
 def characteristic_polynomial(z: Array) -> tuple[Array, Array]:
@@ -130,19 +138,65 @@ def _smallest_radii(certified: Callable[[Array, Array], Array], like: Array, n: 
     return jax.lax.fori_loop(0, _COUNT, descend, (jnp.asarray(_LARGEST), jnp.full_like(like, jnp.inf)))[1]
 
 
-def multiplier_errors(real: Array, imaginary: Array, error: Array) -> Array:
+def multiplier_errors(real: Array, imaginary: Array, error: Array, counted: Array | bool = True) -> Array:
     """Bound of the error of each multiplier ``real + i imaginary``, ``(n, ...) -> (n, ...)``; inf if nothing is known.
 
-    ``error`` as in :func:`spectral_radius_bound`.
+    ``error`` as in :func:`spectral_radius_bound`. Multipliers that are not ``counted`` ``(n, ...)`` are exactly 0.
     """
     rho = over_first(jnp.maximum, jnp.hypot(real, imaginary))
     distances = jnp.hypot(real[:, None] - real, imaginary[:, None] - imaginary) / rho
 
     def certified(r: Array, eps: Array) -> Array:
         # The distance of a multiplier from itself is 0, so each product has the factor r.
-        return over_first(jnp.multiply, jnp.abs(distances - r)) > eps
+        return over_first(jnp.multiply, jnp.where(counted, jnp.abs(distances - r), 1.0)) > eps
 
     return rho * (_smallest_radii(certified, real, len(real), error) + 4 * np.finfo(float).eps)
+
+
+def graded_multipliers(found: Factored) -> tuple[Array, Array, Array]:
+    """Multipliers in falling order of size, as ``exp(logs) sigma``, with bounds of the errors of sigma, ``(n, ...)`` each.
+
+    Multipliers whose sizes are within a factor of ``1/_APART`` are those of one diagonal block. Its characteristic
+    polynomial is wrong by the difference between both numbers of panels, by rounding, and by what couples it to others.
+    """
+    logs, turn = found.logs[1], found.turn[1]
+    n, axes = len(logs), (1,) * (logs.ndim - 1)
+    place = np.arange(n).reshape(n, *axes)
+    group = [jnp.zeros_like(logs[0])]
+    for i in range(1, n):
+        group.append(group[-1] + (logs[i - 1] - logs[i] > -math.log(_APART)))
+    group = jnp.stack(group)
+    # The block of each multiplier, as a matrix of its own: axes are row, column, number of the multiplier, lanes.
+    member = (group[:, None] == group).astype(float)
+    scale = over_first(jnp.maximum, jnp.where(member > 0, logs[:, None], -jnp.inf))
+    inside = member[:, None] * member
+
+    def blocks(k: int) -> Array:
+        sizes = jnp.exp(jnp.minimum(found.logs[k][:, None] - scale, -math.log(_APART)))
+        left = found.turn[k][:, :, None] * inside * sizes
+        return matmul(left, found.upper[k][:, :, None] * inside)
+
+    coarse, fine = blocks(0), blocks(1)
+    norm = jnp.sqrt(square_sum(fine))
+    real, imaginary = eigenvalues(fine)
+    sigma = sort_multipliers(real, imaginary)
+    rho = jnp.abs(sigma[0])
+    # What couples a block to larger ones falls in each period by the ratio of their moduli.
+    ratio = jnp.exp(3 * jnp.minimum(logs[:, None] - logs, 0.0))
+    leak = jnp.where(jnp.abs(turn) > _SEPARATE, jnp.inf, _COUPLING * ratio)
+    leak = jnp.where((place[:, None] > place) & (member == 0), leak, 0.0)
+    coupled = over_first(jnp.add, jnp.swapaxes(leak, 0, 1))
+    own = np.finfo(float).eps * _ROUNDINGS * found.rounding[1] + coupled
+    relative = over_first(jnp.maximum, member * own[:, None])
+    changes = jnp.abs(characteristic_coefficients(coarse) - characteristic_coefficients(fine))
+    powers = jnp.arange(1, n + 1).reshape(n, *(1,) * rho.ndim)
+    error = over_first(jnp.maximum, changes / rho**powers + n * relative * (norm / rho) ** powers)
+    counted = (powers <= over_first(jnp.add, member))[:, None]
+    errors = multiplier_errors(sigma.real, sigma.imag, error, counted)
+    first = sum((group[j] < group).astype(int) for j in range(n))
+    chosen = (place - first)[None]
+    sigma, errors = (jnp.take_along_axis(x, chosen, axis=0)[0] for x in (sigma, errors))
+    return scale, sigma, errors
 
 
 def all_on_the_circle(real: Array, imaginary: Array, error: Array, scale: Array) -> Array:

@@ -10,6 +10,7 @@ once (:mod:`~drivetrain_jax.analysis.numerics.staged`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial, reduce
 from typing import Any, ClassVar, NamedTuple
 
@@ -24,7 +25,7 @@ from drivetrain_jax.analysis.floquet.direct import Monodromy, Propagator, compar
 from drivetrain_jax.analysis.numerics.collocation import Scheme, first_order, gauss, panel, second_order
 from drivetrain_jax.analysis.numerics.kernels import any_lane, in_one_kernel, on_cpu, stored, suits_one_kernel
 from drivetrain_jax.analysis.numerics.lanes import Constants, blocks_first, blocks_joined, lanes_last, traced_once
-from drivetrain_jax.analysis.numerics.linear_algebra import largest, matmul
+from drivetrain_jax.analysis.numerics.linear_algebra import largest, matmul, square_sum
 from drivetrain_jax.analysis.numerics.staged import staged
 from drivetrain_jax.systems import LinearPeriodic
 
@@ -42,6 +43,8 @@ _UNDAMPED = 2.0 * STAGES * (STAGES + 1)
 _RESOLVED = 4.0
 # Decay over the span beyond which damping is strong.
 _STRONG = 8.0
+# Periods of the iteration for small multipliers, and the largest logarithm of a ratio in it.
+_PERIODS, _FARTHEST = 5, 600.0
 # States beyond this size, or below its inverse, are scaled: far from overflow, even squared and after another panel.
 _FAR = 1e60
 
@@ -115,13 +118,8 @@ class Gauss(diffrax.AbstractSolver):
 
     def solved(self, system: LinearPeriodic) -> tuple[Array, Monodromy]:
         """The propagator over the span, and the monodromy matrix."""
-        arrays, rest = eqx.partition(system, eqx.is_array)
-        fixed = Constants(rest)
         shared = jnp.asarray(self.panels), jnp.asarray(self.rtol, float), jnp.asarray(self.ratio)
-        if not jax.tree.leaves(arrays) or not system.is_pytree:
-            # No arrays to batch, or a function that may depend on unknown arrays.
-            return jax.tree.map(lambda x: x[..., 0], _refined(fixed, arrays, shared))
-        return lanes_last(partial(traced_once, _refined), fixed, arrays, shared)
+        return _of_one(_refined, system, shared)
 
 
 def monodromy(system: LinearPeriodic, panels: Array, rtol: Any, ratio: Any = 2) -> Monodromy:
@@ -151,8 +149,31 @@ def march(system: LinearPeriodic, count: Array) -> Propagator:
     return jax.tree.map(lambda x: x[..., 0], state.propagator(count * len(system.parts)))
 
 
+def factored(system: LinearPeriodic, panels: Array) -> Factored:
+    """The :class:`Factored` monodromy matrix of one point in ``panels`` panels and in twice as many, the first axis."""
+    return _of_one(_in_factors, system, (jnp.asarray(panels),))
+
+
+def _of_one(compute: Callable[..., Any], system: LinearPeriodic, shared: tuple[Array, ...]) -> Any:
+    """``compute(constants, arrays, shared)`` of one system, the last axis of its results being the lanes."""
+    arrays, rest = eqx.partition(system, eqx.is_array)
+    if not jax.tree.leaves(arrays) or not system.is_pytree:
+        # No arrays to batch, or a function that may depend on unknown arrays.
+        return jax.tree.map(lambda x: x[..., 0], compute(Constants(rest), arrays, shared))
+    return lanes_last(partial(traced_once, compute), Constants(rest), arrays, shared)
+
+
+def _in_factors(fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array]) -> Factored:
+    return _by_blocks(_factors_of_block, fixed, arrays, shared)
+
+
 def _refined(fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array, Array, Array]) -> tuple[Array, Monodromy]:
     """The propagator and the monodromy matrix of all lanes, the last axis of ``arrays``."""
+    return _by_blocks(_agreeing, fixed, arrays, shared)
+
+
+def _by_blocks(compute: Callable[..., Any], fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array, ...]) -> Any:
+    """``compute(marches, fixed values, ends, determinant, lanes, *shared)`` of all lanes, in one kernel if possible."""
     lanes = max((x.shape[-1] for x in jax.tree.leaves(arrays) if x.ndim), default=1)
     size = LANES if lanes > LANES and on_cpu() else lanes
     blocks = jax.tree.map(lambda x: blocks_first(x, size) if x.ndim and x.shape[-1] == lanes else x, arrays)
@@ -170,11 +191,11 @@ def _refined(fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array, Arra
     kinds = list(dict.fromkeys(x.shape for x in leaves))
     packed = [jnp.stack([x for x in leaves if x.shape == kind], axis=1) for kind in kinds]
 
-    def all_blocks(shared: tuple[Array, Array, Array], packed: list[Array]) -> tuple[Array, Monodromy]:
-        def block(packed: list[Array]) -> tuple[Array, Monodromy]:
+    def all_blocks(shared: tuple[Array, ...], packed: list[Array]) -> Any:
+        def block(packed: list[Array]) -> Any:
             rows = {kind: iter(stack) for kind, stack in zip(kinds, packed, strict=True)}
             values, ends, determinant = jax.tree.unflatten(tree, [next(rows[x.shape]) for x in leaves])
-            return _agreeing(marches, values, ends, determinant, size, *shared)
+            return compute(marches, values, ends, determinant, size, *shared)
 
         return jax.lax.map(block, packed)
 
@@ -229,6 +250,82 @@ def _agreeing(
     none = jax.tree.map(lambda x: jnp.broadcast_to(x[..., None], (*x.shape, lanes)), unknown(n))
     _, _, propagator, found = jax.lax.while_loop(unfinished, refine, (jnp.int32(0), first, start, none))
     return propagator.matrix, found
+
+
+class Factored(NamedTuple):
+    """A monodromy matrix by QR decompositions of its factors, whose small multipliers keep their relative accuracy.
+
+    In an orthogonal basis the matrix is ``turn exp(logs) upper``: ``turn`` ``(n, n)`` is orthogonal and nearly block
+    triangular, ``logs`` ``(n,)`` fall, and ``upper`` ``(n, n)`` is triangular with unit diagonal. ``rounding`` ``(n,)`` is
+    the sum over all factors of their norm in units of the diagonal entry, the growth of relative errors.
+    """
+
+    turn: Array
+    logs: Array
+    upper: Array
+    rounding: Array
+
+
+def _factors_of_block(
+    marches: list[Panels],
+    fixed: list[Fixed],
+    ends: Array | None,
+    determinant: Array | None,
+    lanes: int,
+    panels: Array,
+) -> Factored:
+    """By simultaneous iteration over several periods: subspaces of separate moduli are those of the last period."""
+    del determinant
+    n = marches[0].size
+    unit = jnp.broadcast_to(jnp.eye(n)[..., None], (n, n, lanes))
+    # No subspace of a decoupled system may be missing from the first vectors.
+    mixed = jnp.broadcast_to(np.linalg.qr(np.vander(np.arange(1, n + 1) / n))[0][..., None], (n, n, lanes))
+    none = jnp.zeros((n, lanes))
+
+    def through(march: Panels, own: Fixed, count: Array, number: Array, state: Factored) -> Factored:
+        back = number >= count
+        factor = march.propagator(own, count, jnp.where(back, 2 * count - 1 - number, number))
+        if ends is not None:
+            start, end = ends.reshape(2, n, n, -1)
+            factor = jnp.where(back, jnp.swapaxes(factor, 0, 1), factor)
+            factor = jnp.where(number == count, stored(matmul)(factor, end), factor)
+            factor = jnp.where(number == 2 * count - 1, stored(matmul)(start, factor), factor)
+        return stored(_multiplied)(factor, state)
+
+    def period(count: Array, turn: Array) -> tuple[Factored, Array]:
+        state = Factored(turn, none, unit, none)
+        for march, own in zip(marches, fixed, strict=True):
+            length = count if ends is None else 2 * count
+            state = jax.lax.fori_loop(0, length, partial(through, march, own, count), state)
+        return state._replace(turn=stored(matmul)(jnp.swapaxes(turn, 0, 1), state.turn)), state.turn
+
+    def of_count(count: Array) -> Factored:
+        start = Factored(unit, none, unit, none), mixed
+        return jax.lax.fori_loop(0, _PERIODS, lambda _, last: period(count, last[1]), start)[0]
+
+    return jax.lax.map(of_count, jnp.stack([panels, 2 * panels]))
+
+
+def _multiplied(factor: Array, state: Factored) -> Factored:
+    """``factor`` times the product so far: its QR decomposition (Gram and Schmidt, twice), in the scales of ``state``."""
+    n, columns, rows = len(factor), [], []
+    moved = matmul(factor, state.turn)
+    norm = jnp.sqrt(square_sum(factor))
+    for j in range(n):
+        column, row = moved[:, j], [jnp.zeros_like(norm)] * n
+        for _ in range(2):
+            for i, unit in enumerate(columns):
+                part = sum(unit[k] * column[k] for k in range(n))
+                column, row[i] = column - part * unit, row[i] + part
+        row[j] = jnp.sqrt(sum(x**2 for x in column))
+        columns.append(column / row[j])
+        rows.append(jnp.stack(row))
+    triangle, turn = jnp.stack(rows, axis=1), jnp.stack(columns, axis=1)
+    own = jnp.stack([triangle[i, i] for i in range(n)])
+    # The scales of earlier columns are larger, once the subspaces are sorted.
+    ratio = jnp.exp(jnp.clip(state.logs - state.logs[:, None], -_FARTHEST, _FARTHEST))
+    upper = matmul(triangle / own[:, None] * ratio, state.upper)
+    return Factored(turn, state.logs + jnp.log(own), upper, state.rounding + norm / own)
 
 
 class _State(NamedTuple):

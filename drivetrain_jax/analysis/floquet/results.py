@@ -7,6 +7,7 @@ The bound follows from the error of the coefficients of the characteristic polyn
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import reduce
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,7 @@ from drivetrain_jax.analysis.floquet.multipliers import (
     VERDICTS,
     all_on_the_circle,
     characteristic_coefficients,
+    graded_multipliers,
     multiplier_errors,
     over_first,
     sort_multipliers,
@@ -35,6 +37,7 @@ from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, square_
 from drivetrain_jax.systems import System
 
 if TYPE_CHECKING:
+    from drivetrain_jax.analysis.floquet.propagator import Factored
     from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
 # Real and imaginary parts of eigenvalues, ``(n, ...)`` each.
@@ -142,14 +145,20 @@ def lacks(system: type[System]) -> dict[str, str]:
 
 
 def _of_multipliers(
-    z: Monodromy, finite: Array, bounded: Array, spectrum: Spectrum, system: LinearPeriodic
+    z: Monodromy,
+    finite: Array,
+    bounded: Array,
+    spectrum: Spectrum,
+    system: LinearPeriodic,
+    factors: Callable[[], Factored] | None,
 ) -> dict[str, Array]:
     """Multipliers with their errors and exponents; NaN where the error exceeds the multiplier.
 
     ``bounded`` ones are known to lie on the unit circle: there the error of the modulus is gone, and the distance from the
     nearest point of the circle is at most twice the error.
     As eigenvalues small multipliers have the absolute errors of large ones. The smaller one of two follows from their
-    product, if that is known, where the moduli differ by more than a factor of two.
+    product, if that is known, where the moduli differ by more than a factor of two; others follow from ``factors`` of the
+    matrix, if given.
     """
     multipliers = jnp.where(finite, sort_multipliers(*spectrum), jnp.nan)
     errors = multiplier_errors(multipliers.real, multipliers.imag, z.error)
@@ -166,6 +175,15 @@ def _of_multipliers(
         errors = jnp.where(apart, relative * jnp.abs(other), errors)
         multipliers = jnp.where(apart, other, multipliers)
         logarithms = jnp.where(apart, log_product - logarithms[0], logarithms)
+    if factors is not None:
+        lacking = finite & jnp.any(~(errors < jnp.abs(multipliers)), axis=0)
+        scale, sigma, wrong = jax.lax.cond(
+            jnp.any(lacking), lambda: graded_multipliers(factors()), lambda: (logarithms, multipliers, errors)
+        )
+        better = ~bounded & (wrong / jnp.abs(sigma) < errors / jnp.abs(multipliers))
+        unit = jnp.exp(scale - z.log_scale)
+        multipliers, errors = jnp.where(better, unit * sigma, multipliers), jnp.where(better, unit * wrong, errors)
+        logarithms = jnp.where(better, scale - z.log_scale + jnp.log(jnp.abs(sigma)), logarithms)
     size, known = jnp.exp(z.log_scale), errors < jnp.abs(multipliers)
     found = {
         "floquet_multiplier": multipliers * size,
@@ -181,10 +199,12 @@ def results(
     rtol: float,
     model: FloquetModel,
     spectrum: Spectrum | None = None,
+    factors: Callable[[], Factored] | None = None,
 ) -> dict[str, Array]:
     """The requested variables and the outcome from a monodromy matrix of ``model`` with trailing batch axes.
 
     Without damping stable means bounded, and the spectral radius of a stable point is 1.
+    ``factors()`` are those of the matrix, computed if multipliers are asked for and lie below the error of the matrix.
     ``spectrum``: real and imaginary parts of the eigenvalues of ``z.matrix``, if known. Otherwise the spectral radius of
     four states comes from the closed form.
     """
@@ -211,7 +231,7 @@ def results(
     rho, error = jnp.where(bounded, 1 / size, rho), jnp.where(bounded, _ROUNDING / size, error)
     found: dict[str, Array] = {}
     if spectrum and wanted & MULTIPLIERS:
-        found = _of_multipliers(z, finite, bounded, spectrum, model.natural)
+        found = _of_multipliers(z, finite, bounded, spectrum, model.natural, factors)
     found |= {"spectral_radius": rho * size, "liouville_residual": jnp.where(finite, z.residual, jnp.nan)}
     met = z.met
     if wanted & NEED_ERROR:
