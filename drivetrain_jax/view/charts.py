@@ -392,7 +392,8 @@ def _scatter(dataset: xr.Dataset) -> Figure:
 def _small_multiples(dataset: xr.Dataset, fields: Sequence[str], forced: bool) -> Figure:
     """Maps over the speed and the longest other axis; columns and rows for the values of further axes.
 
-    Of an axis with many values the first, middle and last are shown; with two further axes only the first of ``fields``.
+    Of an axis with many values the first, middle and last are shown; with two further axes only the first of ``fields``
+    that varies.
     """
     names = sweep_axes(dataset)
     long = [name for name in names if dataset.sizes[name] > _FEW_MAPS]
@@ -407,7 +408,9 @@ def _small_multiples(dataset: xr.Dataset, fields: Sequence[str], forced: bool) -
     across, down = (_slices(dataset, name) for name in [*further, "", ""][:2])
     parts = [[part.isel(column) for column in across] for part in (dataset.isel(row) for row in down)]
     if len(further) > 1:
-        rows = [(fields[0], row) for row in parts]
+        # Verdicts that are the same everywhere say less than how far from a boundary they are.
+        varied = next((key for key in fields if np.ptp(valid(dataset, key).values) != 0), fields[-1])
+        rows = [(varied, row) for row in parts]
     else:
         rows = [row for key in fields for row in split(parts[0], key)]
     titled = [*further[:2], *dict.fromkeys(own_dimension(dataset, key) for key in fields)]

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 
 from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range
 from drivetrain_jax.view.charts import require_values
@@ -19,6 +21,8 @@ from drivetrain_jax.view.style import LINE_COLOURS
 _DASHES = ("solid", "dashed", "dotted", "dashdot")
 # Range of the axes relative to the outermost crossings, and to the highest operating speed.
 _SPACE, _BEYOND = 1.12, 1.4
+# Numbers stand below the line of the mode, clear of the line of the order.
+_NUMBERS: dict[str, Any] = {"va": "top", "path_effects": [withStroke(linewidth=2, foreground="white")]}
 # Most modes of which all orders have numbers.
 _FEW = 8
 
@@ -55,7 +59,9 @@ def draw(dataset: xr.Dataset, orders: Orders, colours: Sequence[str], kinds: Map
         met = met[met[:, 0] <= high]
         axes.plot(*met.T, "o", markersize=3.5, color="black", markerfacecolor="white")
         if k == 0 or operating or shown.size <= _FEW:
-            sheet.later(partial(write_names, axes, met, [f"{speed:.0f}" for speed in met[:, 0]], offset=4.0, va="top"))
+            sheet.later(
+                partial(write_names, axes, met, [f"{speed:.0f}" for speed in met[:, 0]], offset=4.0, **_NUMBERS)
+            )
     if operating:
         sheet.add(axes.axvspan(*operating, color=LINE_COLOURS[1], alpha=0.2, zorder=0, label="operating speeds"))
     sheet.label(f"speed of the {orders.shaft} [rpm]", "natural frequency [Hz] (number of the mode at the right)")

@@ -16,7 +16,6 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogFormatterMathtext, LogLocator, NullFormatter
 
 from drivetrain_jax.view.style import FRAME_GREY, caption
@@ -210,13 +209,13 @@ def write_names(
     above: bool = False,
     ranks: Sequence[int] = (),
     offset: float = 3.0,
-    va: str = "center",
     colours: Any = FRAME_GREY,
+    **look: Any,
 ) -> None:
     """Write ``names`` to the right of ``points`` (or ``above``), ``offset`` points away, with a line to a name that moved.
 
-    ``va`` is the vertical alignment beside a point. Names keep the order of their points. Where there is no space for all,
-    those of the smallest ``ranks`` stay.
+    Names keep the order of their points. Where there is no space for all, those of the smallest ``ranks`` stay. ``look``
+    goes to :meth:`matplotlib.axes.Axes.annotate`.
     """
     colours = [colours] * len(names) if isinstance(colours, str) else list(colours)
     scale, spacing, axis = 72 / axes.figure.dpi, _SPACING[above], 0 if above else 1
@@ -231,12 +230,11 @@ def write_names(
             kept, shifts = trial, moved
     for k, shift in zip(kept, shifts, strict=True):
         line = {"arrowstyle": "-", "linewidth": 0.5, "color": colours[k], "shrinkA": 1, "shrinkB": 0}
-        style: dict[str, Any] = {"ha": "center", "va": "bottom"} if above else {"ha": "left", "va": va}
+        style: dict[str, Any] = {"ha": "center", "va": "bottom"} if above else {"ha": "left", "va": "center"}
         if offset > _NEAR or abs(shift) > 1:
             style["arrowprops"] = line | {"relpos": (0.5, 0.0) if above else (0.0, 0.5)}
         beyond = max(offset, _NEAR + 4) if abs(shift) > 1 else offset
-        style |= {"path_effects": [withStroke(linewidth=2, foreground="white")]}
-        style |= {"size": 7.5, "color": colours[k], "annotation_clip": False, "textcoords": "offset points"}
+        style |= {"size": 7.5, "color": colours[k], "annotation_clip": False, "textcoords": "offset points"} | look
         axes.annotate(names[k], points[k], (shift, beyond) if above else (beyond, shift), **style)
 
 

@@ -144,6 +144,16 @@ def test_a_range_without_a_boundary_shows_how_far_it_is_from_one():
     np.testing.assert_allclose(drawn, np.tile(np.log10(0.99 - dataset.zeta.values), (11, 1)), rtol=1e-12)
 
 
+def test_nine_slices_without_a_boundary_show_growth():
+    values = np.linspace(1.0, 2.0, 5)
+    names = ("beta", "Omega", "mu", "alpha")
+    dataset = results.with_axes(results.grid(np.zeros((5,) * 4, int), *names), **dict.fromkeys(names, values))
+    dataset["spectral_radius"] = dataset.spectral_radius - 0.1 * dataset.beta
+    drawn = [mesh.get_array() for mesh in meshes(plot(dataset))]
+    assert len(drawn) == 9
+    np.testing.assert_allclose(drawn[0][:, 0], np.log10(0.99 - 0.1 * values), rtol=1e-12)
+
+
 def test_points_are_drawn_by_verdict():
     code = np.array([0, 1, 1, 2, 3, 0])
     dataset = results.grid(code, "point").assign_coords(
