@@ -186,10 +186,11 @@ def open_result(path: Path) -> xr.Dataset:
         raise InputError(f"file = {str(path)!r}: does not exist; give a result written by `drivetrain run`")
     read_attribute(path, "digest")
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as dataset:
+        with xr.open_dataset(path, engine="h5netcdf", phony_dims="sort") as dataset:
             result = dataset.load()
     except (AttributeError, *BROKEN):
         raise unreadable(path) from None
-    if "analysis" not in result.attrs:
+    # Variables of a result share named dimensions.
+    if "analysis" not in result.attrs or any(str(dim).startswith("phony_dim") for dim in result.dims):
         raise InputError(f"file = {str(path)!r}: not a result of drivetrain_jax; give one written by `drivetrain run`")
     return result

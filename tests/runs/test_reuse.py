@@ -411,6 +411,10 @@ def test_content_with_valid_checksums_that_is_no_result_is_refused(tmp_path, cha
         with pytest.raises(InputError, match=r"holds a damaged result \((value|outcome|wave)\); --fresh"):
             run_to_file(scene_there, path)
         assert status(scene_there, path).state == "stale"
+    if change is not _without_values:
+        for read in (dt.open_result, dt.plot):
+            with pytest.raises(InputError, match="not a result of drivetrain_jax"):
+                read(path)
 
 
 def test_damage_during_an_interrupted_growth_is_named(tmp_path):
