@@ -279,7 +279,14 @@ def _connect(distributed: Any, address: str, stack: ExitStack) -> Any:
     try:
         if local := _LOCAL.fullmatch(address):
             count = int(local.group(1))
-            cluster = distributed.LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None)
+            # Without a dashboard; its port of 0 is any free one, where the default would warn beside another cluster.
+            cluster = distributed.LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                silence_logs=logging.CRITICAL,
+                dashboard_address=None,
+                scheduler_kwargs={"dashboard_address": ":0"},
+            )
             address = stack.enter_context(cluster).scheduler_address
         return stack.enter_context(distributed.Client(address, timeout=_ANSWERED, set_as_default=False))
     except RuntimeError as error:
