@@ -125,13 +125,16 @@ def _smallest(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def relative_error_of_z(atlas: StabilityAtlas, points: np.ndarray) -> np.ndarray:
-    """Error of Z at ``points`` against direct solves, relative to the norm of Z."""
+    """Error of the balanced Z at ``points`` against direct solves, relative to the norm of Z."""
+    from drivetrain_jax.atlas.floquet import balanced_entries, floquet_domain
     from drivetrain_jax.atlas.interpolation import evaluate
     from drivetrain_jax.atlas.panels import position
-    from tests.oracles.atlas_direct import monodromy, propagators
+    from tests.oracles.atlas_direct import CARDAN, monodromy, propagators
 
     columns = {**atlas.atlas.fixed, **dict(zip(atlas.atlas.parameters, points.T, strict=True))}
-    exact = monodromy(propagators(columns, 1e-14))
+    ranges = dict(zip(atlas.atlas.parameters, zip(atlas.atlas.lower, atlas.atlas.upper, strict=True), strict=True))
+    domain = floquet_domain(CARDAN, ranges, atlas.atlas.fixed)
+    exact = monodromy(balanced_entries(CARDAN, domain, points, propagators(columns, 1e-14)))
     x = atlas.atlas.to_coordinates(points)
     number, phi = atlas.atlas.find(x), np.empty((len(points), 16))
     for k, panel in enumerate(atlas.atlas.panels):

@@ -127,18 +127,32 @@ class Criteria:
         vanishes where two pairs meet.
         """
         z = monodromy(phi)
-        a, _, c = invariants(z)
-        rounding = 4 * np.finfo(float).eps * (1 + np.sqrt((z**2).sum(axis=(0, 1))))
-        da, db, dc = (error + rounding for error in panel.derived_error)
+        a, b, c = invariants(z)
+        unit = np.eye(_STATES).reshape(_STATES, _STATES, *(1,) * (z.ndim - 2))
+        # Derivatives of b and c by the entries of Z, transposed; that of a is the unit.
+        of_b = a * unit - z
+        of_c = b * unit - sum(z[:, j, None] * of_b[j] for j in range(_STATES))
+        size, norm = (np.sqrt((x**2).sum(axis=tuple(range(x.ndim - z.ndim + 2)))) for x in (phi, z))
+        rounding = 16 * np.finfo(float).eps * (1 + norm)
+
+        matrix = phi.reshape(z.shape)
+        changed = (2 * size + panel.value_error) * panel.value_error
+
+        def error(slope: np.ndarray) -> np.ndarray:
+            """The error of a combination of a, b, c with this derivative by Z, terms of higher order included."""
+            by_phi = sum(matrix[:, j, None] * slope[j] for j in range(_STATES))
+            first = 2 * np.sqrt((by_phi**2).sum(axis=(0, 1))) * panel.value_error  # pyright: ignore[reportAttributeAccessIssue]
+            return first + 15 * (1 + norm + changed) * changed**2 + rounding
+
         if self.conservative:
-            minors = 2 * np.sqrt((phi**2).sum(axis=0)) * panel.value_error + rounding
-            first = np.stack([*(minors,) * 4, np.abs(a) / 2 * da + db])
+            minors = 2 * size * panel.value_error + rounding
+            first = np.stack([*(minors,) * 4, error(a / 2 * unit - of_b)])
             return first, np.zeros_like(first)
         d, missing = np.exp(log_determinant), -np.expm1(log_determinant)
         with np.errstate(all="ignore"):
-            w, dw = (a + a * d - 2 * c) / missing, np.max(((1 + d) * da + 2 * dc) / missing)
-            pair = db + np.abs(a) / 2 * da + dw**2 / 4
-        first = np.stack([da + db + dc, da + db + dc, np.where(missing == 0, np.inf, pair)])
+            w, dw = (a + a * d - 2 * c) / missing, np.max(error((1 + d) * unit - 2 * of_c) / missing)
+            pair = error(a / 2 * unit - of_b) + dw**2 / 4
+        first = np.stack([error(of_b - unit - of_c), error(of_b + unit + of_c), np.where(missing == 0, np.inf, pair)])
         return first, np.stack([0 * w, 0 * w, w * dw / 2])
 
     def eigenvalues(self, x: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ smaller panels (with coefficients 0). The lanes are the last axis of every array
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby, islice
@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.atlas import interpolation
 from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
 from drivetrain_jax.atlas.panels import Atlas, Panel, between, chebyshev, position, position_between
 
@@ -24,34 +23,6 @@ from drivetrain_jax.atlas.panels import Atlas, Panel, between, chebyshev, positi
 _WORKING_SET = 1 << 22
 # Points of a line that are evaluated at a time, and mean number of points per line above which lines save time.
 _LINE, _SHARED = 1 << 10, 2
-
-
-def values_at(
-    atlas: Atlas, points: np.ndarray, solve: Callable[[np.ndarray], np.ndarray] | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """The functions of ``atlas`` at points ``(N, d)`` (parameters): values ``(N, m)`` and bounds ``(N,)``.
-
-    A bound limits the norm of the error of the panel, without rounding at evaluation. Points in gaps or outside are solved
-    by ``solve(points) -> values``, as in the construction, and have the bound 0; without ``solve`` they are NaN. Raises
-    ``ValueError`` if there is neither a panel nor ``solve``.
-    """
-    points = np.asarray(points, float)
-    x = atlas.to_coordinates(points)
-    number = atlas.find(x)
-    uncovered = number < 0
-    direct = np.asarray(solve(points[uncovered]), float) if solve and uncovered.any() else None
-    if not atlas.panels and direct is None:
-        reasons = "; ".join(sorted({gap.reason for gap in atlas.gaps}))
-        raise ValueError(f"atlas without a panel ({reasons}): allowed is one that covers some of its domain")
-    size = atlas.panels[0].coefficients.shape[-1] if atlas.panels else direct.shape[1]  # pyright: ignore[reportOptionalMemberAccess]
-    values, bounds = np.full((len(points), size), np.nan), np.full(len(points), np.nan)
-    for k, panel in enumerate(atlas.panels):
-        mine = number == k
-        values[mine] = interpolation.evaluate(panel.coefficients, position(panel, x[mine]))
-        bounds[mine] = panel.value_error
-    if direct is not None:
-        values[uncovered], bounds[uncovered] = direct, 0.0
-    return values, bounds
 
 
 def scattered(tensor: Array, weights: Sequence[Array]) -> Array:
@@ -237,7 +208,7 @@ def _reductions(
     def reduced(coefficients: np.ndarray, fixed: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], Panel]]:
         k = len(fixed)
         if k == len(groups):
-            yield fixed, Panel(panel.lower[-2:], panel.upper[-2:], coefficients, 0.0, np.empty(0))
+            yield fixed, Panel(panel.lower[-2:], panel.upper[-2:], coefficients, 0.0)
             return
         for i in groups[k]:
             weights = chebyshev(_positions(panel, k, axes[k][i : i + 1]), panel.degrees[k])[0]

@@ -1,4 +1,4 @@
-"""The atlas of the floquet analysis of a system: quantity, tolerance of the solves, and evaluation."""
+"""The atlas of the floquet analysis of a system: what it interpolates, nodes from power series, and evaluation."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -18,35 +18,220 @@ from drivetrain_jax._threads import threads
 from drivetrain_jax.analysis.floquet.effort import stable_steps, steps_needed
 from drivetrain_jax.analysis.floquet.power_series import propagators_along
 from drivetrain_jax.analysis.numerics.kernels import Words, compiler_options, predicted, split
-from drivetrain_jax.atlas.construction import MAX_SOLVES, Domain, Rounds, construct
+from drivetrain_jax.atlas.construction import MAX_SOLVES, Axes, Domain, Function, construct
 from drivetrain_jax.atlas.panels import Atlas, Panel
-from drivetrain_jax.atlas.quantity import floquet_quantity
 from drivetrain_jax.atlas.stability import StabilityAtlas
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, Series, Smoothness, System
+
+# Ratio of the tolerance of direct solves to that of the atlas, and the smallest tolerance that rounding allows.
+_SOLVES_SHARPER, _FINEST = 3e-2, 1e-13
+
+
+def solve_rtol(tolerance: float) -> float:
+    """``rtol`` of the analysis ``floquet_propagator`` for the solves of an atlas."""
+    return max(_SOLVES_SHARPER * tolerance, _FINEST)
+
+
+def floquet_domain(system: type[System], ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, Any]) -> Domain:
+    """The box ``ranges`` (name to lower and upper value) of ``system`` with the coordinates that the system declares."""
+    smooth = _smooth(system)
+    names = tuple(ranges)
+    return Domain(
+        names,
+        tuple(float(ranges[name][0]) for name in names),
+        tuple(float(ranges[name][1]) for name in names),
+        tuple(smooth.coordinate(name) for name in names),
+        dict(fixed),
+    )
+
+
+def floquet_atlas(
+    system: type[System],
+    ranges: Mapping[str, tuple[float, float]],
+    fixed: Mapping[str, float],
+    tolerance: float,
+    solve: Callable[[np.ndarray], np.ndarray],
+    max_solves: int = MAX_SOLVES,
+) -> Atlas:
+    """An atlas of the propagator, or of ``T Phi S`` for a system with a :class:`~drivetrain_jax.systems.Balance`.
+
+    ``solve(points)`` gives the variables of the analysis ``floquet_propagator`` with ``rtol = solve_rtol(tolerance)`` at
+    points in parameters ``(N, d)``, in one array ``(N, 2 n n)``. Errors are relative to the size of the monodromy matrix.
+    """
+    return construct(*_function(system, ranges, fixed, tolerance, solve), tolerance, max_solves)
+
+
+def numbers_per_solve(
+    system: type[System], ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, float]
+) -> int:
+    """Number of values per solve for :func:`floquet_atlas`: entries of the propagator, and their errors."""
+    return 2 * _form(system, floquet_domain(system, ranges, fixed)).size ** 2
+
+
+def prepare_judging(
+    system: type[System],
+    ranges: Mapping[str, tuple[float, float]],
+    fixed: Mapping[str, float],
+    rtol: float,
+    outputs: Sequence[str],
+) -> None:
+    """Compile the kernel that decides single cells of :func:`stability_atlas`, by evaluating a zero atlas.
+
+    This takes seconds, in which other cores can compile and run the solves for the real atlas.
+    """
+    domain = floquet_domain(system, ranges, fixed)
+    box, ends = domain.box(), (np.array(domain.lower), np.array(domain.upper))
+    panel = Panel(box.lower, box.upper, np.zeros((*[1] * len(ranges), _form(system, domain).size ** 2)), 0.0)
+    zero = Atlas(domain.parameters, domain.coordinates, *ends, domain.fixed, (panel,), (), 0.0, 0)
+    stability_atlas(zero, system, rtol).by_eigenvalues((ends[0] + ends[1])[None] / 2, tuple(outputs))
+
+
+def stability_atlas(atlas: Atlas, system: type[System], rtol: float) -> StabilityAtlas:
+    """Spectral radius, bound and verdict from an atlas of :func:`floquet_atlas`; ``rtol`` determines outcomes."""
+    return StabilityAtlas(atlas, system.models["floquet"].build, rtol)
+
+
+def _smooth(system: type[System]) -> Smoothness:
+    return system.models["atlas"].smooth or Smoothness({})
+
+
+def _middle(domain: Domain) -> dict[str, Any]:
+    """One value of each parameter."""
+    middle = {name: (a + b) / 2 for name, a, b in zip(domain.parameters, domain.lower, domain.upper, strict=True)}
+    return {**domain.fixed, **middle}
+
+
+def _form(system: type[System], domain: Domain) -> LinearPeriodic:
+    return system.models["floquet"].build(_middle(domain)).reduced
+
+
+def balanced_entries(system: type[System], domain: Domain, points: np.ndarray, entries: np.ndarray) -> np.ndarray:
+    """``T A S`` for entries of A ``(N, n n)`` at points in parameters, A itself without a balance."""
+    if (balance := _smooth(system).balance) is None:
+        return entries
+    values = {**domain.fixed, **dict(zip(domain.parameters, points.T, strict=True))}
+    left, right = (scales.reshape(len(scales), -1).T for scales in balance.scales(values, _middle(domain)))
+    matrices = entries.reshape(len(points), left.shape[1], -1)
+    return (left[:, :, None] * matrices * right[:, None]).reshape(entries.shape)
+
+
+def _function(
+    system: type[System],
+    ranges: Mapping[str, tuple[float, float]],
+    fixed: Mapping[str, float],
+    tolerance: float,
+    solve: Callable[[np.ndarray], np.ndarray],
+) -> tuple[Domain, Function]:
+    """The domain, and the entries of the balanced propagator as functions of its coordinates."""
+    domain = floquet_domain(system, ranges, fixed)
+    form, balanced = _form(system, domain), partial(balanced_entries, system, domain)
+    n, x = form.size, None if form.reversor is None else np.array(form.reversor)
+
+    def solved(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        points = domain.points(at)
+        values, errors = (balanced(points, each) for each in np.split(np.asarray(solve(points), float), 2, axis=1))
+        return values, np.linalg.norm(errors, axis=1)
+
+    def scale(values: np.ndarray) -> np.ndarray:
+        if x is None:
+            return np.linalg.norm(values, axis=1)
+        phi = values.reshape(-1, n, n)
+        z = x @ np.swapaxes(phi, 1, 2) @ x @ phi
+        # |dZ| <= 2 |Phi| |dPhi|.
+        return np.linalg.norm(z, axis=(1, 2)) / (2 * np.linalg.norm(values, axis=1))
+
+    function = Function(solved, scale)
+    if (nodes := series_nodes(system, domain, tolerance)) is None:
+        return domain, function
+
+    def start(axes: Axes) -> Callable[[], np.ndarray]:
+        waiting = nodes.start(axes)
+        at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+        return lambda: balanced(domain.points(at), waiting())
+
+    return domain, Function(
+        solved, scale, start, partial(_degrees, system, domain, tolerance) if _smooth(system).balance else None
+    )
+
+
+# Numbers of polynomials from the growth in complex coordinates.
+
+
+# Truncation error relative to the tolerance, its least, and the most coordinates for which it is known beforehand: with
+# more, there are five times as many nodes as a search finds sufficient.
+_TRUNCATED, _ROUNDING, _FEW = 3e-4, 1e-15, 2
+_TOO_MANY = 10_000
+# Radii of the ellipses on which the growth is bounded, and arcs of half an ellipse.
+_RADII, _ARCS = np.geomspace(1.03, 200, 120), 48
+
+
+def _degrees(
+    system: type[System], domain: Domain, tolerance: float, lower: np.ndarray, upper: np.ndarray
+) -> tuple[list[int], float]:
+    """Numbers of polynomials on a box, and the largest truncation error; infinite with more than ``_FEW`` coordinates.
+
+    Interpolation at n Chebyshev nodes of a function bounded by M on the ellipse of radius r leaves out at most
+    4 M r^(1-n)/(r-1). With several coordinates these errors add up, each times the Lebesgue constants of earlier ones.
+    """
+    smooth, d = _smooth(system), len(lower)
+    corners = np.array(list(itertools.product(*zip(lower, upper, strict=True)))).T
+    columns = {**domain.fixed, **dict(zip(domain.parameters, domain.points(corners.T).T, strict=True))}
+    determinant = system.models["floquet"].build(columns).reduced.log_determinant
+    # The size of Phi falls with its determinant.
+    size = math.exp(float(np.min(determinant())) / 8) if determinant else 1.0
+    target = max(_TRUNCATED * tolerance * size, _ROUNDING)
+    fixed = {name: smooth.coordinate(name).forward(value) for name, value in domain.fixed.items()}
+    x = {**fixed, **dict(zip(domain.parameters, corners[..., None, None], strict=True))}
+    counts, error, lebesgue = [], 0.0, 1.0
+    for k, name in enumerate(domain.parameters):
+        around = (upper[k] + lower[k]) / 2 + (upper[k] - lower[k]) / 2 * _ARCS_AROUND
+        with np.errstate(all="ignore"):
+            growth = smooth.balance.growth({**x, name: around}, _middle(domain))  # pyright: ignore[reportOptionalMemberAccess]
+        growth = np.broadcast_to(np.nan_to_num(growth, nan=np.inf), (2**d, *around.shape))
+        largest = growth.max(axis=(0, 2)) + np.log(4 / (_RADII - 1))
+        needed = 1 + (largest - math.log(target)) / np.log(_RADII)
+        best = int(np.argmin(needed))
+        if not needed[best] < _TOO_MANY:
+            return [_TOO_MANY] * d, math.inf
+        counts.append(max(math.ceil(needed[best]), 1))
+        error += lebesgue * math.exp(largest[best] - (counts[-1] - 1) * math.log(_RADII[best]))
+        lebesgue *= 1 + 2 / math.pi * math.log(counts[-1] + 1)
+    return counts, error if d <= _FEW else math.inf
+
+
+def _ellipses() -> np.ndarray:
+    """Corners of boxes around the arcs of ellipses with the foci -1 and 1, ``(radii, 4 arcs)``: the growth rises to one."""
+    angles = np.linspace(0, math.pi, _ARCS + 1)
+    real, imaginary = (np.outer(_RADII + sign / _RADII, part(angles)) / 2 for sign, part in ((1, np.cos), (-1, np.sin)))
+    ends = slice(None, -1), slice(1, None)
+    return np.concatenate([real[:, i] + 1j * imaginary[:, j] for i in ends for j in ends], axis=1)
+
+
+_ARCS_AROUND = _ellipses()
+
 
 # Nodes of an atlas from power series along one coordinate: a whole line costs as much as a few solves.
 
 
 # Lines computed together, and divisor of the number of positions along them, so that few kernels serve all panels.
-_LANES, _POSITIONS = 16, 48
+_LANES, _POSITIONS = 16, 24
 # Parts of the span per step of the explicit scheme at 1e-10, with a truncation error of 3e-14 of the propagator. Reduction
 # in parts per decade of looser tolerance (four at most). Parts per step of decay.
 _PARTS, _LEAST, _SPARED, _MOST_SPARED, _DECAY = 0.11, 3e-14, 0.0105, 4, 3.0
 # Largest truncation error relative to the tolerance; a line above it is computed again with twice the parts.
-_SHARPER, _MOST_PARTS = 1e-2, 4_000
+_SHARPER, _MOST_PARTS = 1e-3, 4_000
 # Tolerance below which rounding of the parts shows in their product. Many steps of decay have the same effect, because the
 # product is then small.
 _TOO_FINE, _STIFF = 5e-13, 50
-# Settings at which steps are predicted, and the angle of one step.
-_STEPS_AT, _RADIANS = 1e-10, 0.155
+# Tolerance at which steps are predicted.
+_STEPS_AT = 1e-10
 
 Key = tuple[Callable[..., FloquetModel], Series, tuple[str, ...], Words, tuple[tuple[str, tuple[int, ...]], ...]]
 
 
 def series_nodes(system: type[System], domain: Domain, tolerance: float) -> SeriesNodes | None:
     """The source of nodes for ``domain``; None without a series of the system, or if the parts would be too inaccurate."""
-    smooth = system.models["atlas"].smooth
-    series = smooth.series if smooth else None
+    series = _smooth(system).series
     if series is None or series.parameter not in domain.parameters or tolerance < _TOO_FINE:
         return None
     corners = np.array(list(itertools.product(*zip(domain.lower, domain.upper, strict=True))))
@@ -60,9 +245,7 @@ def _stable_steps(build: Callable[..., FloquetModel], values: Any) -> Array:
 
 
 class SeriesNodes:
-    """Propagators on grids of coordinates, as a source of nodes for :func:`construct`."""
-
-    positions = _POSITIONS
+    """Propagators on grids of coordinates, in lines along the coordinate of the series."""
 
     def __init__(self, system: type[System], domain: Domain, series: Series, decay: float, tolerance: float) -> None:
         self._system, self._domain, self._series = system, domain, series
@@ -78,25 +261,13 @@ class SeriesNodes:
         shapes = tuple((name, value.shape) for name, value in self._fixed.items())
         self._key = (system.models["floquet"].build, series, names, words, shapes)
 
-    def radians(self, lower: np.ndarray, upper: np.ndarray) -> float:
-        """About half the angle through which propagators turn on a line between two corners, from its number of steps.
+    def start(self, axes: Axes) -> Callable[[], np.ndarray]:
+        """Start computing the grid of ``axes``; returns a function that waits for the values ``(N, n n)`` in C order.
 
-        Infinite if the line needs too many steps.
+        Values are NaN on lines along which the series does not converge.
         """
-        pairs = [np.array(pair) for pair in zip(lower, upper, strict=True)]
-        end = max(pairs[self.axis], key=abs)
-        _, steps = self._lines([pair if k != self.axis else np.array([end]) for k, pair in enumerate(pairs)])
-        most = float(np.max(steps))
-        if not self._parts * most <= _MOST_PARTS:
-            return math.inf
-        return _RADIANS * most * float(np.ptp(pairs[self.axis])) / (2 * abs(end)) if end else 0.0
-
-    def start(self, axes: Sequence[np.ndarray]) -> Callable[[], np.ndarray]:
-        """Start computing the grid of ``axes``; returns a function that waits for the values ``(N, n n)``.
-
-        Points are in C order. Values are NaN on lines along which the series does not converge.
-        """
-        x = axes[self.axis]
+        count, x = len(axes[self.axis]), axes[self.axis]
+        x = np.pad(x, (0, -count % _POSITIONS), mode="edge")
         end = max(x, key=abs)
         columns, steps = self._lines([axis if k != self.axis else np.array([end]) for k, axis in enumerate(axes)])
         parts = np.maximum(np.ceil(self._parts * steps), self._least)
@@ -118,7 +289,8 @@ class SeriesNodes:
                 for future in pending:
                     future.cancel()
             counts = [len(axis) for k, axis in enumerate(axes) if k != self.axis]
-            return np.moveaxis(found.reshape(*counts, *found.shape[1:]), -2, self.axis).reshape(-1, found.shape[-1])
+            found = np.moveaxis(found[:, :count].reshape(*counts, count, -1), -2, self.axis)
+            return found.reshape(-1, found.shape[-1])
 
         return values
 
@@ -135,12 +307,11 @@ class SeriesNodes:
         """Values on up to ``_LANES`` lines, ``(_LANES, P, n n)``; ``end`` is the largest coordinate ``x``."""
         kernel = compiled.result()
         full = {name: np.pad(column, (0, _LANES - len(column)), mode="edge") for name, column in columns.items()}
-        with np.errstate(divide="ignore"):
-            ends = self._domain.coordinates[self.axis].inverse(np.array([0.0, end]))
+        value = self._domain.coordinates[self.axis].inverse(np.array(end))
         while True:
             too_many = not parts <= _MOST_PARTS
             number = np.int64(1 if too_many else parts)
-            phi, left_out = map(np.asarray, kernel(full, self._fixed, ends, number, x / end if end else x))
+            phi, left_out = map(np.asarray, kernel(full, self._fixed, value, number, x / end))
             exact = (left_out <= self._left_out) & (not too_many)
             if too_many or exact.all():
                 break
@@ -153,108 +324,16 @@ def _kernel(key: Key, positions: int) -> Future[Any]:
     """:func:`propagators_along` for ``_LANES`` lines, compiled in a separate thread."""
     build, series, names, words, fixed = key
 
-    def lines(columns: dict, numbers: dict, ends: Array, parts: Array, x: Array) -> tuple[Array, Array]:
-        given = {**dict(words), **numbers, **columns}
-
-        def form(value: Array) -> LinearPeriodic:
-            return build({**given, series.parameter: value}).reduced
-
-        return propagators_along(form, ends, series.first, _LANES, parts, x)
+    def lines(columns: dict, numbers: dict, value: Array, parts: Array, x: Array) -> tuple[Array, Array]:
+        form = build({**dict(words), **numbers, **columns, series.parameter: value}).reduced
+        return propagators_along(form, _LANES, parts, x)
 
     def array(*shape: int) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct(shape, float)
 
     def compiled() -> Any:
         columns, numbers = {name: array(_LANES) for name in names}, {name: array(*shape) for name, shape in fixed}
-        arguments = columns, numbers, array(2), jax.ShapeDtypeStruct((), np.int64), array(positions)
+        arguments = columns, numbers, array(), jax.ShapeDtypeStruct((), np.int64), array(positions)
         return jax.jit(lines, compiler_options=compiler_options(_LANES, short_loops=True)).lower(*arguments).compile()
 
     return threads(2, "series").submit(compiled)
-
-
-# Ratio of the tolerance of direct solves to that of the atlas, and the smallest tolerance that rounding allows.
-_SOLVES_SHARPER, _FINEST = 3e-2, 1e-13
-
-
-def solve_rtol(tolerance: float) -> float:
-    """``rtol`` of the analysis ``floquet_propagator`` for the solves of an atlas."""
-    return max(_SOLVES_SHARPER * tolerance, _FINEST)
-
-
-def floquet_domain(system: type[System], ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, Any]) -> Domain:
-    """The box ``ranges`` (name to lower and upper value) of ``system`` with the coordinates that the system declares."""
-    smooth = system.models["atlas"].smooth or Smoothness({})
-    names = tuple(ranges)
-    return Domain(
-        names,
-        tuple(float(ranges[name][0]) for name in names),
-        tuple(float(ranges[name][1]) for name in names),
-        tuple(smooth.coordinate(name) for name in names),
-        dict(fixed),
-    )
-
-
-def floquet_rounds(
-    system: type[System],
-    ranges: Mapping[str, tuple[float, float]],
-    fixed: Mapping[str, float],
-    tolerance: float,
-    max_solves: int = MAX_SOLVES,
-) -> Rounds:
-    """The construction of an atlas of the propagator, as :func:`~drivetrain_jax.atlas.construct`.
-
-    It requests the variables of the analysis ``floquet_propagator``, in one array, with ``rtol = solve_rtol(tolerance)``.
-    """
-    domain = floquet_domain(system, ranges, fixed)
-    quantity = floquet_quantity(_form(system, domain))
-    return construct(domain, quantity, tolerance, source=series_nodes(system, domain, tolerance), max_solves=max_solves)
-
-
-def numbers_per_solve(
-    system: type[System], ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, float]
-) -> int:
-    """Number of values per solve for :func:`floquet_rounds`: entries of the propagator, and their errors."""
-    return 2 * floquet_quantity(_form(system, floquet_domain(system, ranges, fixed))).size
-
-
-def prepare_judging(
-    system: type[System],
-    ranges: Mapping[str, tuple[float, float]],
-    fixed: Mapping[str, float],
-    rtol: float,
-    outputs: Sequence[str],
-) -> None:
-    """Compile the kernel that decides single cells of :func:`stability_atlas`, by evaluating a zero atlas.
-
-    This takes seconds, in which other cores can compile and run the solves for the real atlas.
-    """
-    domain = floquet_domain(system, ranges, fixed)
-    middle = [(a + b) / 2 for a, b in zip(domain.lower, domain.upper, strict=True)]
-    quantity = floquet_quantity(_form(system, domain))
-    nothing = np.zeros((1, quantity.size))
-    box = domain.box()
-    panel = Panel(
-        box.lower, box.upper, nothing.reshape(*[1] * len(middle), -1), 0.0, np.zeros_like(quantity.derived(nothing)[0])
-    )
-    zero = Atlas(
-        parameters=domain.parameters,
-        coordinates=domain.coordinates,
-        lower=np.array(domain.lower),
-        upper=np.array(domain.upper),
-        fixed=domain.fixed,
-        panels=(panel,),
-        gaps=(),
-        tolerance=0.0,
-        solves=0,
-    )
-    stability_atlas(zero, system, rtol).by_eigenvalues(np.array([middle]), tuple(outputs))
-
-
-def _form(system: type[System], domain: Domain) -> LinearPeriodic:
-    middle = {name: (a + b) / 2 for name, a, b in zip(domain.parameters, domain.lower, domain.upper, strict=True)}
-    return system.models["floquet"].build({**domain.fixed, **middle}).reduced
-
-
-def stability_atlas(atlas: Atlas, system: type[System], rtol: float) -> StabilityAtlas:
-    """Spectral radius, bound and verdict from an atlas of :func:`floquet_rounds`; ``rtol`` determines outcomes."""
-    return StabilityAtlas(atlas, system.models["floquet"].build, rtol)

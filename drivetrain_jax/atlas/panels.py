@@ -24,17 +24,14 @@ _SLACK = 8 * np.finfo(float).eps
 class Panel:
     """One box ``lower``..``upper``, both ``(d,)`` in the coordinates, with ``coefficients`` ``(n_1, ..., n_d, m)``.
 
-    ``value_error`` bounds the Euclidean norm of the error of the m values. ``derived_error`` ``(k,)`` bounds the absolute
-    errors of the k derived numbers (see :class:`~drivetrain_jax.atlas.Quantity`); for the cardan shaft these are a_1, a_2,
-    a_3 of det(sigma I - Z) = sigma^4 + a_1 sigma^3 + a_2 sigma^2 + a_3 sigma + a_4. The bounds are statistical (from
-    held-out solves), not proved, and exclude rounding at evaluation.
+    ``value_error`` bounds the Euclidean norm of the error of the m values. It is statistical (from held-out solves), not
+    proved, and excludes rounding at evaluation.
     """
 
     lower: np.ndarray
     upper: np.ndarray
     coefficients: np.ndarray
     value_error: float
-    derived_error: np.ndarray
 
     @property
     def degrees(self) -> tuple[int, ...]:
@@ -226,10 +223,10 @@ Arrays = dict[str, np.ndarray]
 
 
 def to_arrays(atlas: Atlas) -> Arrays:
-    """Arrays by name. With p panels, g gaps, d parameters, m values and k derived numbers:
+    """Arrays by name. With p panels, g gaps, d parameters and m values:
 
     ``lower``, ``upper`` (d,): the domain in parameters; ``panel_lower``, ``panel_upper``, ``panel_degrees`` (p, d),
-    ``value_error`` (p,), ``derived_error`` (p, k); ``gap_lower``, ``gap_upper`` (g, d), ``gap_reason`` (g,);
+    ``value_error`` (p,); ``gap_lower``, ``gap_upper`` (g, d), ``gap_reason`` (g,);
     ``coefficients`` (c, m): the kept ones, in C order, panel after panel; ``kept``: the bits that mark them
     (``numpy.packbits`` of all panels together).
     """
@@ -248,7 +245,6 @@ def to_arrays(atlas: Atlas) -> Arrays:
         "panel_upper": table(atlas.panels, "upper"),
         "panel_degrees": np.array([p.degrees for p in atlas.panels], np.int32).reshape(-1, d),
         "value_error": np.array([p.value_error for p in atlas.panels]),
-        "derived_error": np.array([p.derived_error for p in atlas.panels]) if flat else np.empty((0, 0)),
         "gap_lower": table(atlas.gaps, "lower"),
         "gap_upper": table(atlas.gaps, "upper"),
         "gap_reason": np.array([gap.reason for gap in atlas.gaps], dtype=object),
@@ -283,7 +279,6 @@ def from_arrays(
                 np.asarray(arrays["panel_upper"][k]),
                 dense.reshape(*degrees[k], -1),
                 float(arrays["value_error"][k]),
-                np.asarray(arrays["derived_error"][k]),
             )
         )
     gaps = [

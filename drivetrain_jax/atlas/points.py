@@ -15,10 +15,9 @@ from jax import Array
 
 from drivetrain_jax.analysis.floquet import quartic
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, in_one_kernel, options_for_few
-from drivetrain_jax.atlas.charts import Cells, errors_of, exact_verdict, in_threads, results_of_coefficients
+from drivetrain_jax.atlas.charts import Build, Cells, exact_verdict, in_threads, results_of_coefficients
 from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
 from drivetrain_jax.atlas.panels import Atlas, Panel, chebyshev, position
-from drivetrain_jax.atlas.quantity import Build
 
 # Panels expanded on small boxes with few polynomials, for fast evaluation of scattered points.
 #
@@ -162,8 +161,7 @@ def evaluated_cells(
             cell.tensor,
             cell.place[:, numbers],
             np.int32(min(rows, ROWS)),
-            errors_of(cell.panel),
-            cell.left_out,
+            cell.panel.value_error + cell.left_out,
             values,
             atlas.fixed,
             rtol,
@@ -182,7 +180,7 @@ def point_kernel(build: Build, undamped: bool, few: bool) -> Any:
     It fills the first ``rows`` rows. ``undamped``: points may be Hamiltonian; ``few``: a block has one row at most.
     """
 
-    def kernel(tensor, place, rows, errors, left_out, values, fixed, rtol):
+    def kernel(tensor, place, rows, error, values, fixed, rtol):
         count = max((*tensor.shape[:-2], tensor.shape[-1]))
         polynomials = in_one_kernel(partial(_chebyshev, count=count))
 
@@ -194,8 +192,8 @@ def point_kernel(build: Build, undamped: bool, few: bool) -> Any:
             model = build({**fixed, **{name: cut(column) for name, column in values.items()}})
             log_d = jnp.broadcast_to(model.reduced.log_determinant(), (LANES,))  # pyright: ignore[reportOptionalCall]
             parts = quartic.blocks(phi)
-            exact = exact_verdict(model, parts, errors[0] + left_out) if undamped else None
-            return results_of_coefficients(quartic.coefficients(parts, log_d, errors[1:, None], left_out), rtol, exact)
+            exact = exact_verdict(model, parts, error) if undamped else None
+            return results_of_coefficients(in_one_kernel(quartic.coefficients)(parts, log_d, error), rtol, exact)
 
         def store(i: Array, results: dict[str, Array]) -> dict[str, Array]:
             return {

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
 from threading import Lock
 from typing import Any
 
@@ -21,13 +21,16 @@ from jax import Array
 
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.analysis.floquet import quartic
-from drivetrain_jax.analysis.floquet.results import VARIABLES
+from drivetrain_jax.analysis.floquet.direct import Monodromy, assemble
+from drivetrain_jax.analysis.floquet.multipliers import characteristic_polynomial
+from drivetrain_jax.analysis.floquet.results import VARIABLES, results
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
+from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
 from drivetrain_jax.atlas import charts, evaluation
+from drivetrain_jax.atlas.charts import Build
 from drivetrain_jax.atlas.evaluation import Tile, tiles
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.points import LANES, Expansion, evaluated_cells, point_kernel
-from drivetrain_jax.atlas.quantity import Build, results_of_propagator
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
 DEFAULT_OUTPUTS = ("spectral_radius", "spectral_radius_error", "verdict")
@@ -70,10 +73,10 @@ class StabilityAtlas:
         options = options_for_few() if few else compiler_options()
         kernel = self.keep(point_kernel(self.build, undamped, few), options, f"points {undamped}")
         unsure = [np.empty(0, int)]
-        for index, results in evaluated_cells(self._expansion, points, x, self.atlas, kernel, self.rtol):
+        for index, cells in evaluated_cells(self._expansion, points, x, self.atlas, kernel, self.rtol):
             for name, values in found.items():
-                values[index] = results[name]
-            unsure.append(index[results["unsure"]])
+                values[index] = cells[name]
+            unsure.append(index[cells["unsure"]])
         again = np.concatenate(unsure)
         for name, values in self.by_eigenvalues(points[again], outputs).items():
             found[name][again] = values
@@ -225,7 +228,7 @@ class StabilityAtlas:
         values = {name: columns[:, k] for k, name in enumerate(self.atlas.parameters)}
         kernel = _point_kernel(self.build, outputs, self.rtol, self.closed_form)
         with _JUDGING:
-            found = kernel(phi, charts.errors_of(self.atlas.panels[number]), values, self.atlas.fixed)
+            found = kernel(phi, self.atlas.panels[number].value_error, values, self.atlas.fixed)
         return {name: np.moveaxis(np.asarray(value), -1, 0) for name, value in found.items()}
 
 
@@ -254,27 +257,53 @@ _scattered = jax.jit(evaluation.scattered, compiler_options=compiler_options())
 def _point_kernel(build: Build, outputs: tuple[str, ...], rtol: float, closed_form: bool) -> Any:
     """The kernel of scattered points, by eigenvalues from Phi; all atlases share it, because compiling takes seconds."""
 
-    def kernel(phi, errors, values, fixed):
-        everything = {**fixed, **values}
-        lanes = jnp.broadcast_to(errors[1:, None], (len(errors) - 1, phi.shape[-1]))
+    def kernel(phi, error, values, fixed):
+        model = build({**fixed, **values})
         if not (closed_form and _FAST & set(outputs)):
-            return results_of_propagator(phi, build, everything, lanes, outputs, rtol)
-        found = results_of_propagator(phi, build, everything, lanes, tuple({*outputs, *DEFAULT_OUTPUTS}), rtol)
-        found |= _sharper(phi, build(everything), errors, found)
+            return _by_eigenvalues(phi, model, error, outputs, rtol)
+        found = _by_eigenvalues(phi, model, error, tuple({*outputs, *DEFAULT_OUTPUTS}), rtol)
+        found |= _sharper(phi, model, error, found)
         return {name: found[name] for name in (*outputs, "outcome")}
 
     return jax.jit(kernel, compiler_options=compiler_options(march=True))
 
 
-def _sharper(phi: Array, model: FloquetModel, errors: Array, found: dict[str, Array]) -> dict[str, Array]:
+def _sharper(phi: Array, model: FloquetModel, error_of_phi: Array, found: dict[str, Array]) -> dict[str, Array]:
     """Results with more verdicts, and with the exact results of Hamiltonian lanes.
 
     Where the interval of rho contains 1, there is a verdict if no multiplier can cross the unit circle (Schur-Cohn).
     """
     parts, log_d = quartic.blocks(phi), jnp.broadcast_to(model.reduced.log_determinant(), phi.shape[1:])  # pyright: ignore[reportOptionalCall]
     rho, error, verdict = (found[name] for name in DEFAULT_OUTPUTS)
-    settled = quartic.nothing_crosses(quartic.coefficients(parts, log_d, errors[1:, None]), log_d)
+    settled = quartic.nothing_crosses(quartic.coefficients(parts, log_d, error_of_phi), log_d)
     verdict = jnp.where((verdict == charts.UNDECIDED) & settled, jnp.where(rho < 1, 0, 1), verdict).astype(jnp.int8)
     if model.hamiltonian is not None:
-        rho, error, verdict = charts.exactly(charts.exact_verdict(model, parts, errors[0]), rho, error, verdict)
+        rho, error, verdict = charts.exactly(charts.exact_verdict(model, parts, error_of_phi), rho, error, verdict)
     return dict(zip(DEFAULT_OUTPUTS, (rho, error, verdict), strict=True))
+
+
+def _by_eigenvalues(
+    phi: Array, model: FloquetModel, error: Array, outputs: tuple[str, ...], rtol: float
+) -> dict[str, Array]:
+    """Results of the floquet analysis for lanes of ``Phi``, its entries by rows ``(n n, N)``, by eigenvalues of Z.
+
+    ``error`` bounds the norm of the error of ``Phi``.
+    """
+    form, n = model.reduced, model.reduced.size
+    matrix = phi.reshape(n, n, -1)
+    z = assemble(form.ends(), matrix)
+    a, slopes = characteristic_polynomial(z)
+    spectrum = eigenvalues(z)
+    rho = jnp.max(jnp.hypot(*spectrum), axis=0)
+    changed = error if form.halves == 1 else (2 * jnp.sqrt(jnp.sum(phi**2, axis=0)) + error) * error
+    # The exact determinant has no error.
+    known = n if form.log_determinant is None else n - 1
+    relative = reduce(jnp.maximum, (n**0.5 * slopes[k] * changed / rho ** (k + 1) for k in range(known)))
+    residual = jnp.zeros_like(rho)
+    if form.log_determinant is not None:
+        residual = ((-1) ** n * a[-1] - jnp.exp(form.log_determinant())) / rho**n
+        relative = jnp.maximum(relative, jnp.abs(residual))
+    halves = form.halves
+    rounding = 4 * np.finfo(float).eps * jnp.sum(matrix**2, axis=(0, 1)) ** (halves / 2) / rho
+    monodromy = Monodromy(z, jnp.zeros_like(rho), relative + rounding, relative <= 10 * rtol, residual)
+    return results(monodromy, outputs, rtol, model, spectrum=spectrum)

@@ -175,7 +175,6 @@ def _panel(atlas: Atlas, panel: Panel, build: Callable[..., FloquetModel]) -> di
         "upper": panel.upper.tolist(),
         "degrees": list(panel.degrees),
         "value_error": panel.value_error,
-        "derived_error": panel.derived_error.tolist(),
         "log": _interpolated(log_determinant, panel.lower, panel.upper) if known else None,
     }
 

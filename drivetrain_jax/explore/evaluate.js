@@ -1,4 +1,4 @@
-// An atlas as a function: panels, points, slices. Python: atlas/panels.py, atlas/stability.py, atlas/quantity.py.
+// An atlas as a function: panels, points, slices. Python: atlas/panels.py, atlas/stability.py.
 import { EPS, characteristic, eigenvalues, product, radiusBound } from "./linear.js";
 import { conservativeVerdict, invariants, nothingCrosses, radius } from "./quartic.js";
 
@@ -162,25 +162,21 @@ function byEigenvalues(atlas, panel, phi, log) {
     for (let i = 0; i < n; i++) for (let j = 0; j < n; j++) turned[i * n + j] = phi[j * n + i];
     z = product(product(x, product(turned, x, n), n), phi, n);
   }
-  const a = characteristic(z, n), [re, im] = eigenvalues(z, n);
+  const slopes = new Float64Array(n), a = characteristic(z, n, slopes), [re, im] = eigenvalues(z, n);
   const rho = Math.max(...re.map((v, i) => Math.hypot(v, im[i])));
+  const square = phi.reduce((sum, v) => sum + v * v, 0), error = panel.value_error;
+  const changed = atlas.halves === 1 ? error : (2 * Math.sqrt(square) + error) * error;
   let relative = 0;
-  panel.derived_error.forEach((error, k) => (relative = Math.max(relative, error / rho ** (k + 1))));
+  // The exact determinant has no error.
+  for (let k = 0; k < (log === null ? n : n - 1); k++) relative = Math.max(relative, (slopes[k] * changed) / rho ** (k + 1));
   if (log !== null) relative = Math.max(relative, Math.abs(((-1) ** n * a[n - 1] - Math.exp(log)) / rho ** n));
-  const square = phi.reduce((sum, v) => sum + v * v, 0);
   const bound = radiusBound(re, im, relative + (8 * EPS * square ** (atlas.halves / 2)) / rho);
   return { spectral_radius: rho, spectral_radius_error: bound, verdict: decide(rho, bound) };
 }
 
 const decide = (rho, error) => (rho + error < 1 ? STABLE : rho - error > 1 ? UNSTABLE : UNDECIDED);
 
-const work = new Float64Array(6), three = new Float64Array(3);
-
-/** Bounds of e1, e2, e3 and of the determinant from those of a panel and of rounding. */
-function errorsOf(panel, rounding, log) {
-  const d = panel.derived_error, kappa4 = Math.exp(log);
-  return [d[0] + rounding[3], d[1] + rounding[4], d[2] + rounding[5], determinantError(log, panel.log.error) * kappa4];
-}
+const work = new Float64Array(9), three = new Float64Array(3);
 
 /** Relative error of exp(log). */
 export const determinantError = (log, error) => 8 * EPS * (1 + Math.abs(log)) + error;
@@ -188,8 +184,9 @@ export const determinantError = (log, error) => 8 * EPS * (1 + Math.abs(log)) + 
 /** Results from Phi (n x n entries by rows) and log det Z at one point of a panel. */
 export function judge(atlas, panel, phi, log, hamiltonian) {
   if (!atlas.closed_form) return byEigenvalues(atlas, panel, phi, log);
-  invariants(phi, 0, work);
-  const [e1, e2, e3] = work, d = errorsOf(panel, work, log);
+  invariants(phi, 0, work, panel.value_error);
+  const [e1, e2, e3] = work;
+  const d = [work[3] + work[6], work[4] + work[7], work[5] + work[8], determinantError(log, panel.log.error) * Math.exp(log)];
   radius(e1, e2, e3, Math.exp(log / 4), ...d, three);
   let [rho, error, wide] = three, verdict = decide(rho, error);
   if ((wide && error > 4 * EPS) || !(Math.abs(rho - 1) > error)) {

@@ -11,6 +11,8 @@ import { invariants, radius } from "./quartic.js";
 const NODES = 24, SPAN = 11;
 // Cells from which on nodes cost less than the cells themselves; factor by which interpolation may amplify rounding.
 const FEWEST = 36, SPREAD = 4;
+// Ratio of the largest derivative between nodes to that at nodes.
+const BETWEEN = 1.5;
 
 const nodes = Float64Array.from({ length: NODES }, (_, i) => Math.cos((Math.PI * (i + 0.5)) / NODES));
 // From values at the nodes to Chebyshev coefficients, row by row.
@@ -167,8 +169,8 @@ function logRows(panel, band, v) {
 
 /** The cells of a box: e1, e2, e3 at the places of its band and piece, then row by row. */
 function fillBox(panel, band, piece, rows, logs, grid) {
-  const width = piece.t.length, count = 3 * width, { e, bounds } = coefficientsOf(panel, band, piece, rows);
-  const left = [0, 1, 2].map((k) => (band.spread ? betweenRows(e, k * width, width, piece) : 0));
+  const width = piece.t.length, count = 3 * width, { e, bounds, changes } = coefficientsOf(panel, band, piece, rows);
+  const left = [0, 1, 2].map((k) => changes[k] + (band.spread ? betweenRows(e, k * width, width, piece) : 0));
   const cells = piece.end - piece.start, mx = panel.log.degrees[1], log = new Float64Array(cells);
   const tables = turned(table(grid.u.subarray(piece.start, piece.end).map((x) => position(panel, 1, x)), mx), cells, mx);
   const line = new Float64Array(count), extra = new Float64Array(3), one = new Float64Array(1).fill(1);
@@ -191,17 +193,20 @@ function turned(matrix, n, m) {
   return found;
 }
 
-/** `e` (rows, 3, columns) at the places of a box; `bounds` (rows, 3): what rounding and the columns add to their errors. */
+/**
+ * `e` (rows, 3, columns) at the places of a box; `bounds` (rows, 3): what rounding and the columns
+ * add to their errors; `changes` (3): bounds of their changes by the error of the panel.
+ */
 function coefficientsOf(panel, band, piece, rows) {
   const nx = panel.degrees[1], width = piece.t.length, weights = table(piece.t, nx), count = band.t.length;
   const e = new Float64Array(count * 3 * width), bounds = new Float64Array(count * 3);
-  const phi = new Float64Array(16), work = new Float64Array(6);
+  const phi = new Float64Array(16), work = new Float64Array(9), changes = new Float64Array(3);
   for (let i = 0; i < count; i++) {
     const at = i * 3 * width;
     let r1 = 0, r2 = 0, r3 = 0;
     for (let c = 0; c < width; c++) {
       combine(rows, i * nx * 16, 16, weights, c * nx, nx, phi);
-      invariants(phi, 0, work);
+      invariants(phi, 0, work, panel.value_error);
       e[at + c] = work[0];
       e[at + width + c] = work[1];
       e[at + 2 * width + c] = work[2];
@@ -209,11 +214,12 @@ function coefficientsOf(panel, band, piece, rows) {
       r1 = Math.max(r1, work[3]);
       r2 = Math.max(r2, work[4]);
       r3 = Math.max(r3, work[5]);
+      for (let k = 0; k < 3; k++) changes[k] = Math.max(changes[k], work[6 + k]);
     }
     bounds.set([r1, r2, r3], 3 * i);
     if (piece.spread) for (let k = 0; k < 3; k++) bounds[3 * i + k] = SPREAD * bounds[3 * i + k] + leftOut(e, at + k * width, 1);
   }
-  return { e, bounds };
+  return { e, bounds, changes: changes.map((x) => (band.spread || piece.spread ? BETWEEN : 1) * x) };
 }
 
 /** The error of interpolation between the rows of a box. */
@@ -225,10 +231,9 @@ function betweenRows(e, at, width, piece) {
 
 const cell3 = new Float64Array(3);
 
-/** The cells of a row of a box from e1, e2, e3 and log det Z there; `extra` is added to the panel's errors. */
-function fillRow(panel, { start, end }, [e1, e2, e3], log, extra, { out, unsure }, r) {
-  const [x1, x2, x3] = panel.derived_error, logError = panel.log.error;
-  const d1 = x1 + extra[0], d2 = x2 + extra[1], d3 = x3 + extra[2];
+/** The cells of a row of a box from e1, e2, e3 and log det Z there; `errors` bounds their errors. */
+function fillRow(panel, { start, end }, [e1, e2, e3], log, errors, { out, unsure }, r) {
+  const [d1, d2, d3] = errors, logError = panel.log.error;
   for (let i = 0, cell = r * out.columns + start; i < end - start; i++, cell++) {
     const kappa = Math.exp(log[i] / 4), kappa2 = kappa * kappa;
     radius(e1[i], e2[i], e3[i], kappa, d1, d2, d3, determinantError(log[i], logError) * kappa2 * kappa2, cell3);

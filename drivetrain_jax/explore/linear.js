@@ -17,16 +17,18 @@ export function product(a, b, n) {
   return c;
 }
 
-/** Coefficients a_1 .. a_n of det(s I - Z), by the recursion of Faddeev and Le Verrier. */
-export function characteristic(z, n) {
+/** Coefficients a_1 .. a_n of det(s I - Z), by the recursion of Faddeev and Le Verrier; sizes of their derivatives into `slopes`. */
+export function characteristic(z, n, slopes) {
   let power = z;
   const found = new Float64Array(n);
+  slopes[0] = Math.sqrt(n);
   for (let k = 1; k <= n; k++) {
     let trace = 0;
     for (let i = 0; i < n; i++) trace += power[i * n + i];
     const a = -trace / k;
     found[k - 1] = a;
     if (k < n) {
+      slopes[k] = Math.sqrt(power.reduce((sum, v, i) => sum + (v + (i % (n + 1) ? 0 : a)) ** 2, 0));
       power = product(z, power, n);
       for (let i = 0; i < n * n; i++) power[i] += a * z[i];
     }

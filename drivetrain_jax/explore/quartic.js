@@ -1,14 +1,17 @@
 // Spectral radius of four multipliers in closed form, with Smith's discs as bound: analysis/floquet/quartic.py and
 // atlas/charts.py, one point at a time. A point is [[A, B], [C, D]] = Phi, its 16 entries by rows.
 
-import { EPS } from "./linear.js";
+import { EPS, product } from "./linear.js";
 
 const NEWTON_STEPS = 9;
 // Roundings in a coefficient, twice as many as in Python: sums have another order here, so what is too close stays undecided.
 const ROUNDINGS = 32;
 
-/** e1, e2, e3 of `phi[at ..]` into `out[0 .. 2]`, bounds of their rounding into `out[3 .. 5]`. */
-export function invariants(phi, at, out) {
+/**
+ * e1, e2, e3 of `phi[at ..]` into `out[0 .. 2]`, bounds of their rounding into `out[3 .. 5]`, and bounds of their changes by an
+ * error of phi of the norm `error` into `out[6 .. 8]`.
+ */
+export function invariants(phi, at, out, error) {
   const a11 = phi[at], a12 = phi[at + 1], b11 = phi[at + 2], b12 = phi[at + 3];
   const a21 = phi[at + 4], a22 = phi[at + 5], b21 = phi[at + 6], b22 = phi[at + 7];
   const c11 = phi[at + 8], c12 = phi[at + 9], d11 = phi[at + 10], d12 = phi[at + 11];
@@ -31,9 +34,20 @@ export function invariants(phi, at, out) {
   const squares = s11 * s11 + s12 * s12 + s21 * s21 + s22 * s22;
   const others = u11 * u11 + 2 * u12 * u12 + u22 * u22 + v11 * v11 + 2 * v12 * v12 + v22 * v22;
   const z = Math.sqrt(2 * squares + others);
-  out[3] = ROUNDINGS * EPS * size;
-  out[4] = out[3] * z;
-  out[5] = out[4] * z;
+  // 2 |Phi G| with G_2 = e1 I - Z and G_3 = e2 I - G_2 Z are the derivatives of e2 and e3 by the entries of Phi.
+  const Z = [s11, s12, u11, u12, s21, s22, u12, u22, v11, v12, s11, s21, v12, v22, s12, s22];
+  const one = phi.subarray(at, at + 16), two = product(one, Z, 4);
+  for (let i = 0; i < 16; i++) two[i] = out[0] * one[i] - two[i];
+  const three = product(two, Z, 4);
+  for (let i = 0; i < 16; i++) three[i] = out[1] * one[i] - three[i];
+  const norm = (x) => Math.sqrt(x.reduce((sum, v) => sum + v * v, 0));
+  const changed = (2 * Math.sqrt(size) + error) * error, rounding = ROUNDINGS * EPS * size;
+  out[3] = rounding;
+  out[4] = rounding * z;
+  out[5] = rounding * z * z;
+  out[6] = changed;
+  out[7] = 2 * norm(two) * error + 4 * changed * changed;
+  out[8] = 2 * norm(three) * error + 10 * (z + changed) * changed * changed;
 }
 
 /** A root >= 0 of w^3 + p2 w^2 + p1 w + p0, p0 <= 0, by Newton's method from where it converges monotonically. */

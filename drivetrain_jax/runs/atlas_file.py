@@ -89,7 +89,6 @@ _VARIABLES = {
     "panel_upper": (("panel", "parameter"), "upper corner of a panel, in coordinates"),
     "panel_degrees": (("panel", "parameter"), "number of Chebyshev polynomials of a panel"),
     "value_error": (("panel",), "bound of the error of the propagator (Frobenius norm)"),
-    "derived_error": (("panel", "derived"), "bounds of the errors of the coefficients of det(sigma I - Z)"),
     "coefficients": (("coefficient", "entry"), "Chebyshev coefficients that are not 0, panel after panel in C order"),
     "kept": (("byte",), "bits that say which coefficients are not 0, of all panels together (most significant first)"),
     "gap_lower": (("gap", "parameter"), "lower corner of a box without a panel, in coordinates"),

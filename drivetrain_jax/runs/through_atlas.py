@@ -1,4 +1,4 @@
-"""Compute a scene from an atlas: build it in rounds of blocks, evaluate its panels, solve the points in gaps directly."""
+"""Compute a scene from an atlas: build it from blocks of solves, evaluate its panels, solve the points in gaps directly."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from drivetrain_jax.analysis.atlas.analysis import SOLVES
 from drivetrain_jax.atlas import (
     Atlas,
     StabilityAtlas,
+    floquet_atlas,
     floquet_domain,
-    floquet_rounds,
     numbers_per_solve,
     prepare_judging,
     solve_rtol,
@@ -198,22 +198,22 @@ def build_atlas(
     fixed = fixed_of(scene, ranges)
     rtol = scene.request.options["rtol"]
     tolerance = _tolerance(scene)
-    rounds = floquet_rounds(scene.system, ranges, fixed, tolerance, max_solves or MAX_SOLVES)
     options = {"rtol": solve_rtol(tolerance)}
     width = numbers_per_solve(scene.system, ranges, fixed)
-    first, values = 0, None
-    while True:
-        try:
-            points = rounds.send(values)  # pyright: ignore[reportArgumentType]
-        except StopIteration as end:
-            progress.note = _note(end.value)
-            return stability_atlas(end.value, scene.system, rtol), first
+    first = 0
+
+    def solve(points: np.ndarray) -> np.ndarray:
+        nonlocal first
         job = Job(_solves(scene, fixed, tuple(ranges), points, options), DIRECT, full_size=True)
         answers = _Answers(len(points), width)
         progress.total += len(points)
         work.do(job, answers, progress, first)
         first += job.boxes.count
-        values = answers.values
+        return answers.values
+
+    atlas = floquet_atlas(scene.system, ranges, fixed, tolerance, solve, max_solves or MAX_SOLVES)
+    progress.note = _note(atlas)
+    return stability_atlas(atlas, scene.system, rtol), first
 
 
 def _note(atlas: Atlas) -> str:
@@ -247,7 +247,7 @@ def fixed_of(scene: Scene, ranges: Mapping[str, tuple[float, float]]) -> dict[st
 
 
 def _solves(scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.ndarray, options: Mapping) -> Nodes:
-    """The solves of one round."""
+    """The direct solves of some points."""
     axes = tuple(
         Axis(name, scene.system.parameter(name), None, column) for name, column in zip(names, points.T, strict=True)
     )
@@ -265,7 +265,7 @@ class Nodes(Problem):
 
 
 class _Answers:
-    """The results of the points of a round, ``(N, m)``, NaN for unsolved points."""
+    """The results of some points, ``(N, m)``, NaN for unsolved points."""
 
     def __init__(self, count: int, width: int) -> None:
         self.values = np.full((count, width), np.nan)

@@ -13,6 +13,7 @@ from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
 from drivetrain_jax.resonances import Family, Resonances
 from drivetrain_jax.systems._base import Conversion, Model, PhysicalData, System, parameter, serves
 from drivetrain_jax.systems._models import (
+    Balance,
     Block,
     Coordinate,
     DrivenSprings,
@@ -38,6 +39,7 @@ _BUILT_IN = {
 }
 
 __all__ = [
+    "Balance",
     "Block",
     "Component",
     "Conversion",

@@ -57,25 +57,41 @@ def identity(name: str) -> Coordinate:
 
 @dataclass(frozen=True)
 class Series:
-    """``A(t) = A0(t) + x A1(t)`` with the coordinate x of ``parameter``, for the reduced form of a ``FloquetModel``.
+    """``A(t) = x B(t)`` with the coordinate x of ``parameter``, for the reduced form of a ``FloquetModel``.
 
-    ``A0`` leads only from the ``first`` states to the others: ``A0[i, j] = 0`` unless ``i >= first > j``. The propagator is
-    then a power series in x whose terms are integrals.
+    The propagator is then a power series in x whose terms are integrals.
     """
 
     parameter: str
-    first: int
+
+
+Columns = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Balance:
+    """Interpolated is ``T Phi S`` with diagonal T and S that keep the multipliers: its entries are of one size, and bounded.
+
+    ``scales(values, middle)`` are the diagonals of T and S, ``(n, ...)`` each, for columns of parameters; ``middle`` holds
+    one value of each parameter, for the whole domain. ``growth(x, middle)`` bounds ``ln |T Phi S|`` (Frobenius norm) for
+    columns ``x`` of the coordinates of all parameters, of which one may be complex.
+    """
+
+    scales: Callable[[Columns, Columns], tuple[np.ndarray, np.ndarray]]
+    growth: Callable[[Columns, Columns], np.ndarray]
 
 
 @dataclass(frozen=True)
 class Smoothness:
     """Coordinates by parameter in which the results of a model are smooth; a missing parameter is its own coordinate.
 
-    With ``series`` an atlas solves all its nodes along the parameter of the series together.
+    With ``series`` an atlas computes all its nodes along the parameter of the series together. With ``balance`` too, the
+    numbers of its polynomials and the error of leaving out all others are known beforehand.
     """
 
     coordinates: Mapping[str, Coordinate]
     series: Series | None = None
+    balance: Balance | None = None
 
     def coordinate(self, parameter: str) -> Coordinate:
         """The coordinate of ``parameter``."""

@@ -36,6 +36,8 @@ from drivetrain_jax.systems._base import (
 )
 from drivetrain_jax.systems._models import (
     SWAP,
+    Balance,
+    Columns,
     Components,
     Coordinate,
     FloquetModel,
@@ -182,6 +184,55 @@ def _inverse_square(x: Any) -> np.ndarray:
     return 1 / np.asarray(x) ** 2
 
 
+def _typical(middle: Columns) -> tuple[float, float]:
+    """sqrt(mu) and 1/sqrt(gamma) of a domain."""
+    return middle["mu"] ** 0.5, middle["gamma"] ** -0.5
+
+
+def _scales(values: Columns, middle: Columns) -> tuple[np.ndarray, np.ndarray]:
+    """T, which depends on the angle alone, and S: near them (T Phi S) is orthogonal without damping."""
+    root_mu, g = _typical(middle)
+    one = np.ones_like(np.asarray(values["beta"], float))
+    t, k, s = max(root_mu, 1.0) ** 0.5 / np.sqrt(np.cos(values["beta"])), (root_mu * g) ** 0.5, (1 + root_mu**2) ** 0.25
+    return np.stack([t, k * one, 1 / t, one / k]), np.stack([one / s, one / k, s * one, k * one])
+
+
+def _growth(x: Columns, middle: Columns) -> np.ndarray:
+    """ln of a bound of |T Phi S| for coordinates x, of which one is complex: eq. (16)."""
+    mu, alpha, zeta = x["mu"], np.abs(x["alpha"]), np.abs(x["zeta"])
+    s, root_mu, g, half = np.abs(x["Omega"]), np.sqrt(np.abs(mu)), np.abs(x["gamma"]), math.pi / 2
+    c, turn = np.exp(-np.real(x["beta"])), np.abs(np.imag(x["beta"]))
+    cosine, tangent = np.cos(turn / 2), np.tan(turn / 2)
+    # |Im w| over the w of |cos(beta)|, and the integrals of |eta'|, of |eta eta'|, and of w eta^2.
+    aside = np.where(turn <= half, np.sin(turn / 2), 1 / (2 * cosine))
+    bend = np.sqrt(1 + c**4 - 2 * c**2 * np.cos(2 * turn)) / (c * cosine**2)
+    steep, square = bend * (1 + c**2) / (2 * c * cosine), half * (1 + c**2) / (2 * c)
+
+    def negative(name: str) -> np.ndarray:
+        return np.maximum(-np.real(x[name]), 0.0)
+
+    rotation = half * (np.maximum(1, root_mu * g) + root_mu) * (np.abs(np.imag(x["Omega"])) / cosine + s * aside)
+    rotation += half * s * root_mu * (np.abs(np.sin(np.angle(mu) / 2)) * (1 + g) + np.abs(np.imag(x["gamma"])))
+    driven = square / cosine**3 + g**2 * half / cosine
+    damped = 2 * (zeta * negative("Omega") + s * negative("zeta")) * (half / cosine + alpha * driven)
+    damped += 2 * zeta * s * (negative("alpha") * driven + alpha * np.imag(x["gamma"]) ** 2 * half)
+    damped += 8 * zeta * alpha * s * tangent * (tangent * square / cosine + aside * (square / cosine + g * half))
+    coupled = zeta * alpha * (steep + g * bend) + root_mu * bend / 2
+    # From the balanced states at the start, and to them at the end.
+    typical_root, typical_g = _typical(middle)
+    t, k, first = (
+        max(typical_root, 1.0) ** 0.5 / np.sqrt(c),
+        (typical_root * typical_g) ** 0.5,
+        (1 + typical_root**2) ** 0.25,
+    )
+    end = t**2 + (k / (g * c)) ** 2 + (k / (root_mu * g)) ** 2 + (1 + zeta**2 * (1 + alpha / c**2) ** 2) / t**2
+    end += (1 + (zeta * alpha * g) ** 2 * (1 / c**2 + 1 / root_mu**2)) / k**2
+    start = (1 + (root_mu * c) ** 2 + zeta**2 * ((1 + alpha * c**2) ** 2 + (2 * alpha * g * c) ** 2)) / first**2
+    start += first**2 + k**2 + ((root_mu * g) ** 2 + (zeta * alpha * g**2) ** 2) / k**2
+    # The path around the poles of eta ends where cos(beta) is negative.
+    return np.where(turn < 3.1, rotation + damped + coupled + np.log(end * start) / 2, np.inf)
+
+
 # Phi is entire in 1/Omega, mu, alpha, zeta, 1/sqrt(gamma) and ln sec(beta). The last holds because the path of integration
 # can avoid the poles of eta, sin(tau)^2 = 1/sin(beta)^2, and because cos(beta) = 0 or infinity is infinitely far away.
 SMOOTH = Smoothness(
@@ -200,8 +251,8 @@ SMOOTH = Smoothness(
             "1/sqrt(gamma)", lambda x: 1 / np.sqrt(x), _inverse_square, lambda x: -0.5 / (np.sqrt(x) * np.asarray(x))
         ),
     },
-    # For 1/Omega = 0 only the gyroscopic terms are left, which lead from q to P.
-    series=Series("Omega", first=2),
+    Series("Omega"),
+    Balance(_scales, _growth),
 )
 
 
@@ -287,26 +338,17 @@ class Cardan(System):
         )
 
     def _reduced_rows(self, cos2psi: Any, sin2psi: Any) -> Rows:
-        """``d(q, P)/dpsi = H (q, P)`` in absolute coordinates, P = Omega (q' + C0 q/2), in the clock psi, eqs (9)-(10)."""
+        """``d(q, p)/dpsi = (w/Omega) B(eta) (q, p)`` in absolute coordinates, in the clock psi, eqs (9)-(10)."""
         zeta, alpha, mu = self.zeta, self.alpha, self.mu
-        s, g = 1 / self.Omega, 1 / jnp.sqrt(self.gamma)
-        eta, w, deta, _ = clock(cos2psi, sin2psi, self.beta)
-        w11, w12, w22 = 1 + alpha * eta**2, -alpha * g * eta, alpha * g**2
-        v11, v12, v22 = 1 + mu * eta**2, -mu * g * eta, mu * g**2
-        sw = s * w
-        zs = zeta * sw
-        zzs = zeta * zs
-        gyroscopic = alpha * zeta * g * deta
-        k11 = zzs * (w11**2 + w12**2) - sw * v11
-        k12 = zzs * w12 * (w11 + w22) - sw * v12
-        k22 = zzs * (w12**2 + w22**2) - sw * v22
-        d11, d12, d22 = -zs * w11, -zs * w12, -zs * w22
-        return (
-            (d11, d12, sw, 0),
-            (d12, d22, 0, sw),
-            (k11, k12 - gyroscopic, d11, d12),
-            (k12 + gyroscopic, k22, d12, d22),
-        )
+        g = 1 / jnp.sqrt(self.gamma)
+        eta, w, _, _ = clock(cos2psi, sin2psi, self.beta)
+        sw = w / self.Omega
+        f11, f21, f22 = zeta * (1 + alpha * eta**2), -2 * zeta * alpha * g * eta, zeta * alpha * g**2
+        k11 = sw * (f11**2 + f21**2 - 1 - mu * eta**2)
+        k12 = sw * (f21 * f22 + mu * g * eta)
+        k22 = sw * (f22**2 - mu * g**2)
+        d11, d21, d22 = -sw * f11, -sw * f21, -sw * f22
+        return ((d11, 0, sw, 0), (d21, d22, 0, sw), (k11, k12, d11, d21), (k12, k22, 0, d22))
 
     def _absolute_rows(self, cos2psi: Any, sin2psi: Any) -> Rows:
         """``d(q, q_psi)/dpsi`` of the absolute coordinates in the clock psi, eq. (12a)."""

@@ -97,9 +97,7 @@ def test_a_cell_on_a_common_face_has_the_panel_of_a_point():
     """Later tiles overwrite earlier ones; the last panel of each cell is the panel of the point there."""
     ends = [(0.0, 0.5), (0.5, 1.0)]
     panels = tuple(
-        Panel(np.array([a, c]), np.array([b, d]), np.zeros((2, 2, 16)), 0.0, np.zeros(3))
-        for a, b in ends
-        for c, d in ends
+        Panel(np.array([a, c]), np.array([b, d]), np.zeros((2, 2, 16)), 0.0) for a, b in ends for c, d in ends
     )
     atlas = Atlas(("a", "b"), (None, None), np.zeros(2), np.ones(2), {}, panels, (), 1e-9, 0)
     axes = [np.linspace(0.0, 1.0, 5)] * 2

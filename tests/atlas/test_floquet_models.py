@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivetrain_jax.atlas import floquet_rounds, run, solve_rtol, stability_atlas
-from tests.oracles.atlas_direct import BASE, CARDAN, direct_radius, propagators
+from drivetrain_jax.atlas import floquet_atlas, solve_rtol, stability_atlas
+from tests.oracles.atlas_direct import BASE, CARDAN, direct_radius, solves
 
 
 def variant(models):
@@ -30,9 +30,9 @@ def test_atlas_without_own_coordinates_uses_the_parameters():
     fixed = {name: value for name, value in BASE.items() if name not in ranges}
 
     def solve(points):
-        return propagators({**fixed, **dict(zip(ranges, points.T, strict=True))}, solve_rtol(tolerance))
+        return solves({**fixed, **dict(zip(ranges, points.T, strict=True))}, solve_rtol(tolerance))
 
-    atlas = stability_atlas(run(floquet_rounds(plain, ranges, fixed, tolerance), solve), plain, 1e-6)
+    atlas = stability_atlas(floquet_atlas(plain, ranges, fixed, tolerance, solve), plain, 1e-6)
     assert [c.name for c in atlas.atlas.coordinates] == ["beta", "Omega"]
     points = np.array([[0.31, 1.01], [0.35, 1.1], [0.39, 1.19]])
     found, (radius, _) = atlas.at(points), direct_radius(atlas, points)

@@ -177,7 +177,7 @@ def test_a_large_error_leaves_boxes_undecided(atlas):
 
     part = narrow(atlas, {"beta": (0.05, 0.2), "Omega": (1.38, 1.45)})
     assert [tip.name for tip in find_tips(part, CARDAN).tips] == ["S21"]
-    panels = tuple(replace(p, value_error=1e-2, derived_error=np.full(3, 1e-2)) for p in part.panels)
+    panels = tuple(replace(p, value_error=1e-2) for p in part.panels)
     tips = find_tips(replace(part, panels=panels), CARDAN)
     assert tips.undecided
     beta, omega = TIPS["S21"]
@@ -192,7 +192,7 @@ def test_a_tip_that_cannot_be_proved_is_listed_as_such(atlas):
     from drivetrain_jax.atlas.windows import narrow
 
     part = narrow(atlas, {"beta": (0.05, 0.2), "Omega": (1.38, 1.45)})
-    panels = tuple(replace(p, value_error=1e-6, derived_error=np.full(3, 1e-6)) for p in part.panels)
+    panels = tuple(replace(p, value_error=1e-6) for p in part.panels)
     tips = find_tips(replace(part, panels=panels), CARDAN)
     (tip,) = tips.tips
     assert tip.name == "S21" and tip.opens and not tip.proved and tips.undecided

@@ -16,7 +16,7 @@ import numpy as np
 from drivetrain_jax.analysis import Request, Solver
 from drivetrain_jax.analysis.atlas.analysis import SOLVES
 from drivetrain_jax.analysis.numerics.kernels import compiler_options
-from drivetrain_jax.atlas import StabilityAtlas, floquet_rounds, run, solve_rtol, stability_atlas
+from drivetrain_jax.atlas import StabilityAtlas, floquet_atlas, solve_rtol, stability_atlas
 from drivetrain_jax.systems import get_system
 
 CARDAN = get_system("cardan")
@@ -69,8 +69,7 @@ def cardan_atlas(
     def solve(points: np.ndarray) -> np.ndarray:
         return solves({**fixed, **dict(zip(names, points.T, strict=True))}, solve_rtol(tolerance))
 
-    rounds = floquet_rounds(CARDAN, ranges, fixed, tolerance)
-    return stability_atlas(run(rounds, solve), CARDAN, rtol)
+    return stability_atlas(floquet_atlas(CARDAN, ranges, fixed, tolerance, solve), CARDAN, rtol)
 
 
 def monodromy(phi: np.ndarray) -> np.ndarray:

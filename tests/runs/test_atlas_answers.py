@@ -458,7 +458,7 @@ def test_distance_from_one_keeps_its_digits(radius, text):
 
 
 @pytest.mark.parametrize(
-    "name", ["lower", "panel_lower", "panel_degrees", "value_error", "derived_error", "coefficients", "kept", "scene"]
+    "name", ["lower", "panel_lower", "panel_degrees", "value_error", "coefficients", "kept", "scene"]
 )
 def test_a_part_of_an_atlas_is_refused(name):
     """Without the bits that mark the kept coefficients, all coefficients would be 0, and every shaft stable."""

@@ -69,14 +69,13 @@ def exact_natural(v, tau):
 
 
 def exact_transformation(v, tau):
-    """``(q, P) = T (theta, theta')``: eq. (8), then P = Omega (q' + C q/2) of eq. (10)."""
+    """``(q, p) = T (theta, theta')``: eq. (8), then p = Omega q' + zeta F q of eq. (10)."""
     eta, first, _ = exact_ratio(v["beta"], tau)
     g = 1 / mp.sqrt(v["gamma"])
     to_q = mp.matrix([[1, 0, 0, 0], [eta / g, 1 / g, 0, 0], [0, 0, 1, 0], [first / g, 0, eta / g, 1 / g]])
-    a, d = v["alpha"], 2 * mp.mpf(v["zeta"]) / v["Omega"]
-    c = [[d * (1 + a * eta**2), -d * a * eta * g], [-d * a * eta * g, d * a * g**2]]
-    half, omega = mp.mpf(v["Omega"]) / 2, v["Omega"]
-    rows = [[half * c[i][0], half * c[i][1], omega * (i == 0), omega * (i == 1)] for i in range(2)]
+    a, zeta, omega = v["alpha"], mp.mpf(v["zeta"]), v["Omega"]
+    f = [[zeta * (1 + a * eta**2), 0], [-2 * zeta * a * eta * g, zeta * a * g**2]]
+    rows = [[f[i][0], f[i][1], omega * (i == 0), omega * (i == 1)] for i in range(2)]
     return mp.matrix([[1, 0, 0, 0], [0, 1, 0, 0], *rows]) * to_q
 
 

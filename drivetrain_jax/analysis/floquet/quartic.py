@@ -25,8 +25,7 @@ Matrix = list[list[Array]]
 
 EPS = float(np.finfo(float).eps)
 NEWTON_STEPS = 9
-# Roundings in a coefficient, in units of eps times its natural size. The factor also covers an error of Phi, in units of
-# |Phi|: as |dZ| <= 2 |Phi| |dPhi|, the coefficients e_1, e_2, e_3 change by at most 4, 10, 12 times |Phi| |dPhi| |Z|^(k-1).
+# Roundings in a coefficient, in units of eps times its natural size.
 _ROUNDINGS = 16.0
 
 
@@ -75,8 +74,25 @@ def _sum(a: Matrix, b: Matrix) -> Matrix:
     return [[a[i][j] + b[i][j] for j in (0, 1)] for i in (0, 1)]
 
 
-def invariants(phi: Blocks, left_out: Array | float = 0.0) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """``e1, e2, e3`` by principal minors, and bounds of their errors by rounding and by the error ``left_out`` of Phi."""
+def _less_product(factor: Array, a: Matrix, b: Matrix, c: Matrix) -> Matrix:
+    """``factor a - b c``."""
+    size = range(len(a))
+    return [[factor * a[i][j] - sum(b[i][k] * c[k][j] for k in size) for j in size] for i in size]
+
+
+def _norm(a: Matrix) -> Array:
+    return jnp.sqrt(sum(x**2 for row in a for x in row))
+
+
+Three = tuple[Array, Array, Array]
+
+
+def invariants(phi: Blocks, error: Array | float = 0.0) -> tuple[Three, Three, Three]:
+    """``e1, e2, e3`` by principal minors, and bounds of their changes by rounding and by an ``error`` of Phi (its norm).
+
+    By their derivatives the coefficients change by at most ``2 |Phi G_k| error`` to first order, with ``G_1 = I``,
+    ``G_2 = e1 I - Z`` and ``G_3 = e2 I - G_2 Z``. Terms of higher order are bounded by powers of the norms.
+    """
     a, b, c, d = phi
     s = _sum(transposed_product(d, a), transposed_product(b, c))
     upper, lower = transposed_product(d, b), transposed_product(c, a)
@@ -90,8 +106,18 @@ def invariants(phi: Blocks, left_out: Array | float = 0.0) -> tuple[tuple[Array,
     second = s11 * (s11 * s22 - s12 * s21) - u11 * (v11 * s22 - v12 * s21) + u12 * (v11 * s12 - v12 * s11)
     size = sum(square_norm(block) for block in phi)
     z = jnp.sqrt(2 * square_norm(s) + u11**2 + 2 * u12**2 + u22**2 + v11**2 + 2 * v12**2 + v22**2)
-    rounding = _ROUNDINGS * (EPS * size + left_out * jnp.sqrt(size))
-    return (e1, e2, 2 * (first + second)), (rounding, rounding * z, rounding * z**2)
+    rounding = _ROUNDINGS * EPS * size
+    whole = [[*a[0], *b[0]], [*a[1], *b[1]], [*c[0], *d[0]], [*c[1], *d[1]]]
+    matrix = [[s11, s12, u11, u12], [s21, s22, u12, u22], [v11, v12, s11, s21], [v12, v22, s12, s22]]
+    second_slope = _less_product(e1, whole, whole, matrix)
+    slopes = _norm(second_slope), _norm(_less_product(e2, whole, second_slope, matrix))
+    changed = (2 * jnp.sqrt(size) + error) * error
+    changes = (
+        changed,
+        2 * slopes[0] * error + 4 * changed**2,
+        2 * slopes[1] * error + 10 * (z + changed) * changed**2,
+    )
+    return (e1, e2, 2 * (first + second)), (rounding, rounding * z, rounding * z**2), changes  # pyright: ignore[reportReturnType]
 
 
 def with_determinant(e: Sequence[Array] | Array, errors: Sequence[Array] | Array, log_d: Array) -> Coefficients:
@@ -101,13 +127,10 @@ def with_determinant(e: Sequence[Array] | Array, errors: Sequence[Array] | Array
     return Coefficients(*e, kappa, (*errors, 8 * EPS * (1 + jnp.abs(log_d)) * kappa**4))  # pyright: ignore[reportCallIssue]
 
 
-def coefficients(phi: Blocks, log_d: Array, derived_error: Array, left_out: Array | float = 0.0) -> Coefficients:
-    """Characteristic coefficients of ``phi``, with the error ``derived_error`` ``(3, ...)`` of the interpolation.
-
-    For ``left_out`` see :func:`invariants`.
-    """
-    e, rounding = invariants(phi, left_out)
-    return with_determinant(e, [derived_error[k] + rounding[k] for k in range(3)], log_d)
+def coefficients(phi: Blocks, log_d: Array, error: Array | float) -> Coefficients:
+    """Characteristic coefficients of ``phi``, which has an ``error`` of at most this norm."""
+    e, rounding, changes = invariants(phi, error)
+    return with_determinant(e, [a + b for a, b in zip(rounding, changes, strict=True)], log_d)
 
 
 def _cubic_root(p2: Array, p1: Array, p0: Array, steps: Any) -> Array:
