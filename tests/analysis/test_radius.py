@@ -1,4 +1,4 @@
-"""The spectral radius in closed form against eigenvalues."""
+"""The spectral radius in closed form against eigenvalues, where it is certain and where it is not."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_a_determinant_below_rounding_is_counted_as_its_error(smallest):
 
 @pytest.mark.full
 def test_lanes_do_not_depend_on_each_other():
-    """Lanes do not change if another lane needs circles or is NaN."""
+    """Lanes do not change if another lane needs eigenvalues or is NaN."""
     z = matrices(samples(30))
     negative = matrices(np.array([[2.0, -0.5, 0.3, 0.1]], complex))
     alone = radii(z)

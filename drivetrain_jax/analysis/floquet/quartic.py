@@ -12,7 +12,7 @@ functions broadcast; a matrix is a nested list of arrays.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from drivetrain_jax.analysis.numerics.kernels import stored
 Matrix = list[list[Array]]
 
 EPS = float(np.finfo(float).eps)
-NEWTON_STEPS = 9
+_NEWTON_STEPS = 9
 # Roundings in a coefficient, in units of eps times its natural size.
 _ROUNDINGS = 16.0
 
@@ -133,7 +133,7 @@ def coefficients(phi: Blocks, log_d: Array, error: Array | float) -> Coefficient
     return with_determinant(e, [a + b for a, b in zip(rounding, changes, strict=True)], log_d)
 
 
-def _cubic_root(p2: Array, p1: Array, p0: Array, steps: Any) -> Array:
+def _cubic_root(p2: Array, p1: Array, p0: Array) -> Array:
     """A root >= 0 of w^3 + p2 w^2 + p1 w + p0, p0 <= 0.
 
     Newton's method from a start from which it converges monotonically: from 0 if the inflection lies to the right of it
@@ -155,7 +155,7 @@ def _cubic_root(p2: Array, p1: Array, p0: Array, steps: Any) -> Array:
         return jnp.where(slope > 0, jnp.maximum(w - value / slope, 0.0), w)
 
     # Unrolled, each step would repeat all earlier ones in the compiled code.
-    return jax.lax.fori_loop(0, steps, step, jnp.where(concave, 0.0, bound))
+    return jax.lax.fori_loop(0, _NEWTON_STEPS, step, jnp.where(concave, 0.0, bound))
 
 
 class _Factor(NamedTuple):
@@ -185,11 +185,11 @@ class _Factor(NamedTuple):
         return _Factor(*(jnp.where(condition, a, b) for a, b in zip(self, other, strict=True)))
 
 
-def factors(c: Coefficients, steps: Any = NEWTON_STEPS) -> tuple[_Factor, _Factor]:
-    """The two real quadratics, by ``steps`` of Newton's method: the default is not enough for very different moduli."""
+def factors(c: Coefficients) -> tuple[_Factor, _Factor]:
+    """The two real quadratics."""
     a, b, g = stored(_monic)(c.e1, c.e2, c.e3, c.kappa)
     plus, minus, e = (a + g) ** 2 / 4, (a - g) ** 2 / 4, 4 * b - 8
-    w = _cubic_root((16 - e) / 16, (plus - minus - e) / 16, -minus / 16, steps)
+    w = _cubic_root((16 - e) / 16, (plus - minus - e) / 16, -minus / 16)
     one, two = (stored(_factor)(*pair) for pair in stored(_pairs)(a, b, g, w, c.kappa))
     return one, two
 
@@ -217,18 +217,7 @@ def _factor(p: Array, m: Array) -> _Factor:
     return _Factor(m * p / 2, m, m * jnp.sqrt(jnp.abs(radicand)), radicand >= 0)
 
 
-def roots(one: _Factor, two: _Factor) -> tuple[Array, Array]:
-    """Real and imaginary parts of all roots, ``(4, ...)`` each."""
-    real, imaginary = [], []
-    for half, m, gap, is_real in (one, two):
-        large = half + jnp.where(half < 0, -gap, gap)
-        # The smaller of two real roots by their product, because the difference would cancel.
-        real += [jnp.where(is_real, large, half), jnp.where(is_real, m**2 / jnp.where(is_real, large, 1.0), half)]
-        imaginary += [jnp.where(is_real, 0.0, gap), jnp.where(is_real, 0.0, -gap)]
-    return jnp.stack(real), jnp.stack(imaginary)
-
-
-def unexplained(c: Coefficients, one: _Factor, two: _Factor) -> tuple[Array, ...]:
+def _unexplained(c: Coefficients, one: _Factor, two: _Factor) -> tuple[Array, ...]:
     """``errors`` plus the residual of the product of the factors."""
     t1, t2, m1, m2 = 2 * one.half, 2 * two.half, one.m**2, two.m**2
     misses = (c.e1 - (t1 + t2), c.e2 - (m1 + m2 + t1 * t2), c.e3 - (t1 * m2 + t2 * m1), 0.0)
@@ -256,7 +245,7 @@ def spectral_radius(c: Coefficients, split: tuple[_Factor, _Factor] | None = Non
     the error.
     """
     one, two = split or factors(c)
-    errors = unexplained(c, one, two)
+    errors = _unexplained(c, one, two)
     first = one.large >= two.large
     top, other = one.where(first, two), two.where(first, one)
     rho, m = top.large, other.large

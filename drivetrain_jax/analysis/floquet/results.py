@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import reduce
 from typing import TYPE_CHECKING
 
 import jax
@@ -31,7 +30,7 @@ from drivetrain_jax.analysis.floquet.multipliers import (
     spectral_radius_bound,
     verdict,
 )
-from drivetrain_jax.analysis.numerics.kernels import any_lane, in_one_kernel, stored
+from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, stored
 from drivetrain_jax.analysis.numerics.lanes import in_blocks
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, square_sum
 from drivetrain_jax.systems import System
@@ -45,8 +44,8 @@ Spectrum = tuple[Array, Array]
 Radius = tuple[Array, Array]
 # Roundings in a coefficient, in units of eps times a power of the matrix's norm.
 _ROUNDINGS = 16.0
-# Lanes per block of the closed form, and steps of its iteration in the second pass.
-_BLOCK, _MORE_STEPS = 32, 60
+# Lanes per block of the closed form, and lanes whose eigenvalues are computed together.
+_BLOCK, _REPAIRED = 32, 32
 
 
 def has_closed_form(z: Array) -> bool:
@@ -64,44 +63,32 @@ def radius_in_closed_form(
 ) -> tuple[Array, Array, Array]:
     """Spectral radius and bound of ``z`` ``(4, 4, N)``, and flags of bounded motion without damping.
 
-    Blocks of lanes with one that is ``undamped``, or in which the bound by discs is not tight, exceeds ``tolerance`` rho, or
-    leaves open on which side of 1 ``scale`` rho lies, have a second pass: more steps of Newton's method, and bounds by
-    circles.
+    By eigenvalues in lanes that are ``undamped``, or in which the bound of the closed form is not tight, exceeds
+    ``tolerance`` rho, or leaves open on which side of 1 ``scale`` rho lies.
     """
+    lanes = z.shape[-1]
 
     def closed(given: tuple[Array, Array, Array, Array], _: int) -> tuple[Array, Array, Array]:
         z, error, scale, undamped = given
         c, norm = _coefficients(z)
+        split = quartic.factors(c)
+        errors = stored(_errors)(error, jnp.maximum(split[0].large, split[1].large), norm, c.errors[0])
+        rho, bound, unsure = stored(quartic.spectral_radius)(c._replace(errors=errors), split)
+        clear = ~unsure & (bound <= tolerance * rho) & (jnp.abs(scale * rho - 1) > scale * bound)
+        return rho, bound, clear & ~undamped
 
-        def unfinished(state: tuple[Array, ...]) -> Array:
-            return (state[0] == 0) | ((state[0] == 1) & any_lane(~state[1]))
+    def repaired(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        """Some more lanes by eigenvalues."""
+        certain = state[-1]
+        chosen = jnp.nonzero(~certain, size=min(lanes, _REPAIRED), fill_value=jnp.argmin(certain))[0]
+        spectrum = eigenvalues(z[..., chosen])
+        on_circle = all_on_the_circle(*spectrum, error[chosen], scale[chosen])
+        found = *radius_by_eigenvalues(spectrum, error[chosen]), undamped[chosen] & on_circle, True
+        return tuple(x.at[chosen].set(new) for x, new in zip(state, found, strict=True))
 
-        def attempt(state: tuple[Array, ...]) -> tuple[Array, ...]:
-            number, certain = state[:2]
-            one, two = quartic.factors(c, jnp.where(number == 0, quartic.NEWTON_STEPS, _MORE_STEPS))
-            errors = stored(_errors)(error, jnp.maximum(one.large, two.large), norm, c.errors[0])
-            own = c._replace(errors=errors)
-            rho, by_discs, unsure = stored(quartic.spectral_radius)(own, (one, two))
-
-            def circles() -> tuple[Array, Array]:
-                roots = quartic.roots(one, two)
-                total = (x / rho**k for k, x in enumerate(quartic.unexplained(own, one, two), 1))
-                relative = reduce(jnp.maximum, total) + _ROUNDINGS * quartic.EPS
-                by_circles = stored(spectral_radius_bound)(*roots, relative)
-                on_circle = stored(all_on_the_circle)(*roots, relative, scale)
-                return jnp.where(unsure, by_circles, jnp.fmin(by_circles, by_discs)), undamped & on_circle
-
-            bound, bounded = jax.lax.cond(number == 0, lambda: (by_discs, undamped & False), circles)
-            clear = ~unsure & (bound <= tolerance * rho) & (jnp.abs(scale * rho - 1) > scale * bound) & ~undamped
-            # Lanes do not depend on each other.
-            found = (jnp.where(certain, *pair) for pair in zip(state[2:], (rho, bound, bounded), strict=True))
-            return number + 1, clear, *found
-
-        blank = jnp.zeros_like(error)
-        start = jnp.int32(0), undamped & False, blank, blank, undamped & False
-        return jax.lax.while_loop(unfinished, attempt, start)[2:]  # pyright: ignore[reportReturnType]
-
-    return in_blocks(closed, (z, error, scale, undamped), z.shape[-1], _BLOCK, in_one_kernel)
+    rho, bound, certain = in_blocks(closed, (z, error, scale, undamped), lanes, _BLOCK, in_one_kernel)
+    start = rho, bound, undamped & False, certain
+    return jax.lax.while_loop(lambda state: ~jnp.all(state[-1]), repaired, start)[:3]
 
 
 def _coefficients(z: Array) -> tuple[quartic.Coefficients, Array]:
@@ -206,7 +193,7 @@ def results(
     Without damping stable means bounded, and the spectral radius of a stable point is 1.
     ``factors()`` are those of the matrix, computed if multipliers are asked for and lie below the error of the matrix.
     ``spectrum``: real and imaginary parts of the eigenvalues of ``z.matrix``, if known. Otherwise the spectral radius of
-    four states comes from the closed form.
+    four states comes from the closed form, and from eigenvalues only where the closed form is not accurate enough.
     """
     wanted = set(outputs)
     finite = jnp.all(jnp.isfinite(z.matrix), axis=(0, 1))
