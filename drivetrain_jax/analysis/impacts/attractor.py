@@ -65,7 +65,7 @@ _ASTRAY, _COSTLY = 3.0, 4
 _BUDGET, _PER_PERIOD = 4e5, 100
 _EPS = np.finfo(float).eps
 # Rounding of a period over that of the states at its steps.
-_GROWTH = 64
+_GROWTH = 128
 
 
 class Attractors(NamedTuple):
@@ -158,7 +158,7 @@ def _rounding(lanes: Lanes, motion: Motion, state: tuple[Array, Array], omega: A
     by_u, by_v = (newton_correction(motion.matrix, 1.0 - k + 0 * motion.u, k * omega)[0] for k in (0.0, 1.0))
     inverse = jnp.abs(by_u) + jnp.abs(by_v)
     size = jnp.abs(state[0]) + jnp.abs(state[1]) / omega
-    rounding = _GROWTH * size * jnp.sqrt(motion.steps.astype(float)) + 4 * _taken_off(lanes, motion)
+    rounding = _GROWTH * size * jnp.sqrt(motion.steps.astype(float)) + 2 * _taken_off(lanes, motion)
     return _EPS * rounding * (1 + inverse)
 
 
