@@ -110,7 +110,7 @@ class Output:
         Work of another scene, and work that will replace the present result, stay.
         """
         done = self.unfinished.get("digest") in (None, self.present)
-        if self.parts.path.exists() and done and self.unfinished.get("replaces") != self.present:
+        if self.parts.path.exists() and done and not self._replaces_present:
             # Readers can use the result even if the remains cannot be deleted.
             with suppress(InputError, OSError):
                 self.parts.open()
@@ -134,13 +134,28 @@ class Output:
         A store is moved away before another one replaces it.
         """
         same = self.unfinished.get("digest") == self.job.digest and self.unfinished.get("store") == self.store
-        return same and self.present in (None, self.unfinished.get("replaces"))
+        return same and (self.present is None or self._replaces_present)
+
+    @property
+    def _replaces_present(self) -> bool:
+        """True if the unfinished work began beside the result that is present, not one of the same scene before it."""
+        return (self.unfinished.get("replaces"), self.unfinished.get("replaces_written")) == (
+            self.present,
+            self._written,
+        )
+
+    @property
+    def _written(self) -> int | None:
+        """Time at which the present result was written, by the clock of its file system."""
+        file = self.out / "zarr.json" if self.out.is_dir() else self.out
+        return file.stat().st_mtime_ns if file.exists() else None
 
     def plan(self, reused: ReusedPoints = NO_REUSE, fresh: bool = False) -> dict[str, Any]:
         """The digest of new parts, and the entries that a reader needs to interpret them."""
         return {
             "digest": self.job.digest,
             "replaces": self.present,
+            "replaces_written": self._written,
             "store": self.store,
             "fresh": fresh,
             "reuses": reused.digest,

@@ -128,7 +128,10 @@ def find(job: Job, path: Path) -> ReusableResult:
 
     Raises :class:`NotReusable`, or :class:`InputError` if there is no readable result.
     """
-    attrs = consolidate.read_attributes(path)
+    try:
+        attrs = consolidate.read_attributes(path)
+    except InputError as error:
+        raise InputError(str(error).replace("file = ", "reuse = ", 1)) from None
     if "digest" not in attrs:
         raise NotReusable(path, "not a result of drivetrain_jax", "such a result")
     try:

@@ -19,7 +19,7 @@ import xarray as xr
 import drivetrain_jax as dt
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.runs import identity, toml, work
+from drivetrain_jax.runs import toml, work
 from drivetrain_jax.runs.job import Block
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
@@ -176,7 +176,7 @@ def test_wrong_executor_is_one_clear_line(monkeypatch, options, message):
 def test_a_worker_of_another_kind_is_refused_before_it_computes(grid_scene, monkeypatch):
     job = resolve(load_scene(grid_scene))
     sent = pickle.dumps(work.Parcel(job.digest, "", job, None))
-    monkeypatch.setattr(identity, "versions", lambda _: {"jax": "9"})
+    monkeypatch.setattr("drivetrain_jax._programs.versions", lambda _: {"jax": "9"})
     parcel = pickle.loads(sent)
     monkeypatch.setattr(type(job), "compute", lambda *_: pytest.fail("it computes"))
     with pytest.raises(work.Mismatch, match=r"^code, versions or instruction set differ from those of the run$"):

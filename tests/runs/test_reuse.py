@@ -424,7 +424,7 @@ def test_damage_during_an_interrupted_growth_is_named(tmp_path):
         run_to_file(LARGE, path, executor=Threads(1), report=stop_after(2))
     with h5py.File(path, "r+") as file:
         file["value"][1, 3] = -7.0
-    assert "damaged (value)" in status(LARGE, path).reason
+    assert "damaged result (value)" in status(LARGE, path).reason
     with pytest.raises(InputError, match=r"damaged result \(value\); --fresh replaces it"):
         run_to_file(LARGE, path)
 

@@ -88,7 +88,8 @@ def radius_in_closed_form(
 
     rho, bound, certain = in_blocks(closed, (z, error, scale, undamped), lanes, _BLOCK, in_one_kernel)
     start = rho, bound, undamped & False, certain
-    return jax.lax.while_loop(lambda state: ~jnp.all(state[-1]), repaired, start)[:3]
+    rho, bound, bounded, _ = jax.lax.while_loop(lambda state: ~jnp.all(state[-1]), repaired, start)
+    return rho, bound, bounded
 
 
 def _coefficients(z: Array) -> tuple[quartic.Coefficients, Array]:
