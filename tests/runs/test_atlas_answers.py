@@ -85,7 +85,7 @@ def test_boundaries_lie_on_both_sides_of_the_angle_0():
     assert ends["below"]["value"] == pytest.approx(above, rel=1e-12) and ends["above"] is None
 
 
-@pytest.mark.parametrize(("J1", "k1"), [(2.0, 1000.0), (2e-9, 3.7), (1e-170, 1e-170)])
+@pytest.mark.parametrize(("J1", "k1"), full_after(1, [(2e-9, 3.7), (2.0, 1000.0), (1e-170, 1e-170)], several=True))
 def test_the_ends_of_an_atlas_may_be_given_in_other_units(J1, k1):
     """Converted ends, or ends copied from a message, differ from the ends of the atlas by a rounding."""
     atlas, critical = atlas_of((0.0, 0.3), (1.3, 1.5)), 2 * np.sqrt(J1) * np.sqrt(k1)
@@ -297,10 +297,10 @@ def test_stable_intervals_away_from_the_safe_end_are_listed():
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("speeds", "kind", "value"),
-    [((1.3, 1.5), "crossing", S21[0]), ((1.415, 1.417), "undecided", 0.1062824374)],
+    [((1.3, 1.5), "crossing", S21[0]), ((1.415, 1.417), "undecided", 0.1063277628)],
 )
 def test_an_answer_names_the_kinds_of_its_ends(speeds, kind, value):
-    """On a loose atlas the tip of S21 is undecided from .10628 to .10640, in a narrow range of speeds to .11255."""
+    """On a loose atlas the tip of S21 is undecided from .10633 to .10640, in a narrow range of speeds to .11255."""
     reply = atlas_answers.widest_angle(atlas_of((0.0, 1.3), (0.15, 2.0), rtol=1e-5), {"Omega": speeds})
     found = json.loads(reply.to_json())
     start, end = found["intervals"][0]["ends"]

@@ -65,7 +65,7 @@ _ASTRAY, _COSTLY = 3.0, 4
 _BUDGET, _PER_PERIOD = 4e5, 100
 _EPS = np.finfo(float).eps
 # Rounding of a period over that of the states at its steps.
-_GROWTH = 128
+_GROWTH = 64
 
 
 class Attractors(NamedTuple):
@@ -137,7 +137,8 @@ def _shoot(
     astray = ~(_speed(local, *guess) <= _ASTRAY * (_speed(local, *lane.latest) + _usual_speed(local)))
     going = now & ~converged & (lane.corrections < _CORRECTIONS) & ~astray & (change <= _SHRINKING * lane.change)
     contraction = log_determinant(local, motion.matrix, lane.multiple * 2 * np.pi / omega)
-    orbit = Orbit(*guess, motion.matrix, contraction, change + rounding)
+    # At the limit of rounding, what is left may be as large as the last change and more.
+    orbit = Orbit(*guess, motion.matrix, contraction, 2 * change + rounding)
     stable = now & converged & attracts(orbit)
     slow = (
         stable & is_slow(orbit, lane.latest, omega) & ~linearisation_holds(orbit, lane.latest, first, local.b, omega)[0]
