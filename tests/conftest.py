@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pytest
 
-# A reference second is 20 % shorter or longer on some machines, against the same tests: 770 to 935 of them were measured.
 # Limits in reference seconds: of one test that is not marked `full`, and of a whole run of `make test` and `make validate`.
+# The unit differs by 20 % between machines: runs of `make test` measured 770 to 935.
 LONGEST, TOTAL = 5.0, {"not full and not docs": 1100.0, "full": 9000.0}
 # CPU seconds of `reference` on the machine that the limits refer to: there the tests of d7ff433 took 2,300 s.
 REFERENCE = 0.081
