@@ -31,10 +31,11 @@ _GRACE = 2.0
 def _stop_on_signals() -> Iterator[Callable[[], None]]:
     """Raise ``KeyboardInterrupt`` on Ctrl-C and SIGTERM inside the context.
 
-    Yields a function that raises it again after a signal, because a destructor or a C callback may swallow the first one.
-    Further signals are ignored for two seconds, so that finished chunks are written.
+    Yields a function that raises it again after a signal, because a destructor or a C callback may swallow the first one;
+    nothing is printed then. Further signals are ignored for two seconds, so that finished chunks are written.
     """
     caught: list[float] = []
+    report_unraisable = sys.unraisablehook
 
     def check() -> None:
         if caught:
@@ -45,10 +46,16 @@ def _stop_on_signals() -> Iterator[Callable[[], None]]:
         if len(caught) == 1 or caught[-1] - caught[0] > _GRACE:
             raise KeyboardInterrupt
 
+    def report(swallowed: Any) -> None:
+        if swallowed.exc_type is not KeyboardInterrupt:
+            report_unraisable(swallowed)
+
     handlers = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    sys.unraisablehook = report
     try:
         yield check
     finally:
+        sys.unraisablehook = report_unraisable
         for number, handler in handlers.items():
             # A handler that Python did not set cannot be restored.
             signal.signal(number, handler or signal.SIG_DFL)

@@ -25,13 +25,23 @@ class Interrupted:
             pass
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_swallowed_interrupt_is_raised_again():
+class Broken:
+    def __del__(self):
+        raise ZeroDivisionError
+
+
+def test_a_swallowed_interrupt_is_raised_again_and_not_reported(monkeypatch):
+    reported = []
+    monkeypatch.setattr(sys, "unraisablehook", reported.append)
     with _stop_on_signals() as check:
         check()
         Interrupted()
         with pytest.raises(KeyboardInterrupt):
             check()
+        assert not reported
+        Broken()
+    assert [type(swallowed.exc_value) for swallowed in reported] == [ZeroDivisionError]
+    assert sys.unraisablehook.__self__ is reported
 
 
 @pytest.mark.parametrize("stopped", [True, False])
