@@ -53,6 +53,11 @@ class Resonances:
     families: tuple[Family, ...] = ()
     without: tuple[str, ...] = ()
 
+    def family(self, label: str) -> Family | None:
+        """The family of a ``label``, None without one."""
+        fitting = [family for family in self.families if label.startswith(family.prefix)]
+        return max(fitting, key=lambda family: len(family.prefix), default=None)
+
 
 # Predicted parametric resonances of the cardan shaft; names and equation numbers as in ``systems/cardan.py``.
 

@@ -226,9 +226,10 @@ class Window:
 
 @dataclass(frozen=True)
 class Windows:
-    """All ``windows``, and the ``undecided`` ranges, which belong to no window."""
+    """All ``windows``, the ``unstable`` ranges between them, and the ``undecided`` ranges, which belong to neither."""
 
     windows: tuple[Window, ...]
+    unstable: tuple[Interval, ...]
     undecided: tuple[Range, ...]
 
 
@@ -295,7 +296,7 @@ def speed_windows(
         k = int(np.argmax(rho))
         check = direct and check_window((low, high), interval, line, criteria, direct)
         windows.append(Window(interval, (low, high), float(rho[k]), float(values[k]), check))
-    return Windows(tuple(windows), line.undecided)
+    return Windows(tuple(windows), tuple(i for i in line.intervals if not i.stable), line.undecided)
 
 
 def _over(atlas: Atlas, system: type[System], at: Mapping[str, float], *roles: str) -> Atlas:

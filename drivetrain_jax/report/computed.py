@@ -30,7 +30,7 @@ def atlas_answers(
     """
     atlas = open_atlas(path)
     drawn = chart(path, {}, cells[len(atlas.ranges) > 1])
-    asked = {"amplitude": amplitude, "writer": partial(_written, atlas, convert(drawn))}
+    asked = {"amplitude": amplitude, "show": partial(_shown, atlas, convert(drawn))}
     speed, angle, damping = (atlas.scene.system.roles.get(name) for name in ("speed", "angle", "damping"))
     questions = {
         frozenset({speed}): (speed_windows, {}),
@@ -44,13 +44,13 @@ def atlas_answers(
     return reply.sentences(), drawn, bool(reply.data.get("forced"))
 
 
-def _written(atlas: StoredAtlas, shown: xr.Dataset, name: str, value: float) -> str:
+def _shown(atlas: StoredAtlas, drawn: xr.Dataset, name: str, value: float) -> tuple[str, float, str]:
     """A value of a parameter in the units of the report, as physical data where the atlas has these."""
     data = in_parameters(atlas.scene.system, {}, atlas.scene.data)[0]
     quantity = data.quantity(name, value) if data else None
     name, value, units = quantity or (name, value, atlas.scene.system.parameter(name).units)
-    size, units = unit_of(shown, name, units)
-    return f"{name} = {value * size:.6g}{'' if units == '1' else f' {units}'}"
+    size, units = unit_of(drawn, name, units)
+    return name, value * size, units
 
 
 def limit_of(result: xr.Dataset, given: Any) -> Limit | None:

@@ -6,7 +6,7 @@ Every design answer is checked by direct solves.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from drivetrain_jax.analysis import OUTCOME, get_analysis
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
 from drivetrain_jax.atlas import design
 from drivetrain_jax.atlas.criteria import has_boundaries
+from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.windows import Crossing, Interval, narrow
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, check_same
@@ -38,16 +39,23 @@ BEYOND = {
 }
 
 
-Writer = Callable[[str, float], str]
+# The name, the value and the unit in which a value of a parameter is shown.
+Shown = tuple[str, float, str]
+Show = Callable[[str, float], Shown]
 Range = tuple[float, float]
 # Relative tolerance within which a value equals an end of a range: values converted from other units, or copied from a
 # message, are rounded.
 _SAME = 1e-9
 
 
-def number(value: float) -> str:
-    """A number as text, as in answers and messages."""
-    return f"{value:.10g}"
+# Relative distance of a predicted resonance from a range that is named after it.
+_NEAR = 0.05
+
+
+def number(value: float, error: float = 0.0, most: int = 6) -> str:
+    """A number as text with the digits that its ``error`` allows, ``most`` at the most."""
+    known = math.log10(abs(value) / error) if 0 < error < math.inf and value else most
+    return f"{value:.{min(max(int(known), 1), most)}g}"
 
 
 def roles_of(atlas: StoredAtlas, *roles: str) -> list[str]:
@@ -66,8 +74,8 @@ class AtlasQuery:
     atlas: StoredAtlas
     values: Mapping[str, Any]
     shaft: GivenData | None
-    # Writes values instead of `named`, if given.
-    writer: Writer | None = None
+    # Instead of the physical data of the question, if given.
+    show: Show | None = None
 
     @classmethod
     def of(
@@ -116,17 +124,33 @@ class AtlasQuery:
         """The conditions of the answer as text."""
         everything = {**self.values, **self.atlas.fixed}
         return ", ".join(
-            f"{name} = {number(v[0])} to {number(v[1])}" if isinstance(v, tuple) else f"{name} = {number(v)}"
-            for name, v in everything.items()
+            self.span(name, value) if isinstance(value, tuple) else self.named(name, value)
+            for name, value in everything.items()
         )
 
-    def named(self, name: str, value: float) -> str:
-        """A value as text: ``beta = 0.31 (17.76 deg)``."""
-        if self.writer:
-            return self.writer(name, value)
-        physical = self.shaft.quantity(name, value) if self.shaft else None
-        aside = f" ({physical[0]} = {number(physical[1])} {physical[2]})" if physical else ""
-        return f"{name} = {number(value)}{aside}"
+    def shown(self, name: str, value: float) -> Shown:
+        """A value of a parameter as it is shown: as the physical quantity behind it, if that is known."""
+        physical = self.shaft.quantity(name, value) if self.shaft and not self.show else None
+        return self.show(name, value) if self.show else physical or (name, value, "1")
+
+    def named(self, name: str, value: float, error: float | None = None) -> str:
+        """A value as text, with the bound of its ``error`` if given: ``angle = 17.76 deg (beta = 0.31)``."""
+        label, quantity, units = self.shown(name, value)
+        known = error if error is not None and math.isfinite(error) else 0.0
+        aside = [f"{name} = {number(value, known)}"] if label != name and not self.show else []
+        aside += [f"error at most {known:.1e}"] if known else []
+        bound = known * abs(quantity / value) if value else 0.0
+        text = f"{label} = {number(quantity, bound)}{_unit(units)}"
+        return f"{text} ({', '.join(aside)})" if aside else text
+
+    def span(self, name: str, ends: Range) -> str:
+        """A range as text: ``speed = 1422 to 1429 rpm``."""
+        label, _, units = self.shown(name, ends[0])
+        low, high = (self.shown(name, end)[1] for end in ends)
+        # A narrow range needs more digits than a number.
+        width, largest = abs(high - low), max(abs(low), abs(high))
+        digits = max(6, math.ceil(math.log10(largest / width)) + 1) if width else 6
+        return f"{label} = {number(low, most=digits)} to {number(high, most=digits)}{_unit(units)}"
 
     def physical(self, values: Mapping[str, float | Range]) -> dict[str, Any]:
         """``values`` in the physical units of the input; empty without physical input."""
@@ -143,6 +167,10 @@ class AtlasQuery:
                     "units": known[0][2],
                 }
         return found
+
+
+def _unit(units: str) -> str:
+    return "" if units == "1" else f" {units}"
 
 
 def _plain(value: Any) -> Any:
@@ -238,7 +266,28 @@ def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None)
             for each in nearest
         },
     }
-    return Reply(lines, data)
+    return Reply(lines, data, _point_sentence(asked, data["meanings"].get("verdict"), grows, nearest))
+
+
+def _point_sentence(
+    asked: AtlasQuery, verdict: str | None, grows: Mapping[str, float], nearest: Sequence[design.Nearest]
+) -> str:
+    """Verdict, growth and the nearest change of stability along the speed (or the first parameter), in one sentence."""
+    if verdict is None:
+        return ""
+    words = (
+        [verdict.capitalize()] if verdict != "undecided" else ["Undecided: the spectral radius is 1 within its error"]
+    )
+    words += [line.strip().replace("  ", " ") for line in growth_lines(grows, 0, sign="")]
+    speed = asked.atlas.scene.system.roles.get("speed")
+    changes = [(each, c) for each in nearest for c in (each.below, each.above) if c]
+    along = [(each, c) for each, c in changes if each.parameter == speed] or [
+        x for x in changes if x[0] is changes[0][0]
+    ]
+    if along:
+        each, crossing = min(along, key=lambda x: abs(x[1].value - x[0].value))
+        words.append(f"the nearest change of stability lies {_side(asked, each.parameter, each.value, crossing)}")
+    return f"{'; '.join(words)}."
 
 
 def _result_rows(atlas: StoredAtlas, results: Mapping[str, Any], variables: Mapping[str, Variable]) -> list[str]:
@@ -253,25 +302,31 @@ def _result_rows(atlas: StoredAtlas, results: Mapping[str, Any], variables: Mapp
 
 
 def least_damping(
-    atlas: StoredAtlas, given: Mapping[str, float | Range], amplitude: Any = None, writer: Writer | None = None
+    atlas: StoredAtlas,
+    given: Mapping[str, float | Range],
+    amplitude: Any = None,
+    show: Show | None = None,
 ) -> Reply:
     """The least damping above which a range of speeds is stable.
 
     If the largest damping of the atlas is unstable, the answer lists the stable ranges of damping. For a cardan shaft in
     physical units the answer is ``c1``; of given dampings only the ratio ``c2/c1`` is used. Raises as :func:`query`.
     """
-    asked, answer = _limit("damping", design.least_damping, atlas, given, writer)
+    asked, answer = _limit("damping", design.least_damping, atlas, given, show)
     return _answered("least damping", "from {} on", "largest", asked, answer, amplitude)
 
 
 def widest_angle(
-    atlas: StoredAtlas, given: Mapping[str, float | Range], amplitude: Any = None, writer: Writer | None = None
+    atlas: StoredAtlas,
+    given: Mapping[str, float | Range],
+    amplitude: Any = None,
+    show: Show | None = None,
 ) -> Reply:
     """The widest joint angle below which a range of speeds is stable.
 
     If the smallest angle of the atlas is unstable, the answer lists the stable ranges of angle. Raises as :func:`query`.
     """
-    asked, answer = _limit("angle", design.widest_angle, atlas, given, writer)
+    asked, answer = _limit("angle", design.widest_angle, atlas, given, show)
     return _answered("widest angle", "up to {}", "smallest", asked, answer, amplitude)
 
 
@@ -280,11 +335,11 @@ def _limit(
     question: Callable[..., design.Answer],
     atlas: StoredAtlas,
     given: Mapping[str, float | Range],
-    writer: Writer | None,
+    show: Show | None,
 ) -> tuple[AtlasQuery, design.Answer]:
     """The limit of the parameter with this ``role`` within which a range of speeds is stable."""
     speed, limited = roles_of(atlas, "speed", role)
-    asked = replace(AtlasQuery.of(atlas, given, ranges=(speed,), free=(limited,)), writer=writer)
+    asked = replace(AtlasQuery.of(atlas, given, ranges=(speed,), free=(limited,)), show=show)
     panels, system = atlas.stability.atlas, atlas.scene.system
     return asked, question(panels, system, asked.values[speed], asked.numbers(), direct=atlas.direct)
 
@@ -294,17 +349,18 @@ def speed_windows(
     given: Mapping[str, float],
     margin: float = 0.0,
     amplitude: Any = None,
-    writer: Writer | None = None,
+    show: Show | None = None,
 ) -> Reply:
     """The stable ranges of speed, shortened by ``margin`` times the speed at either end, within a range of speeds if one is
     given. Raises as :func:`query`."""
     if not 0 <= margin < 1:
         raise InputError(f"margin = {margin!r}: allowed is 0 <= margin < 1")
     (speed,) = roles_of(atlas, "speed")
-    asked = replace(AtlasQuery.of(atlas, given, ranges=(), free=(speed,), within=(speed,)), writer=writer)
+    asked = replace(AtlasQuery.of(atlas, given, ranges=(), free=(speed,), within=(speed,)), show=show)
     panels = atlas.stability.atlas
     part = narrow(panels, {speed: asked.values[speed]}) if speed in asked.values else panels
     found = design.speed_windows(part, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.direct)
+    names = [_resonance(asked, speed, each) for each in found.unstable]
     compared, forced = forced_over(atlas, amplitude, [w.safe for w in found.windows], asked.numbers(), asked.named)
     lines, sensitivities = [f"safe speeds, {asked.heading()}, margin {margin:g}"], []
     for k, w in enumerate(found.windows):
@@ -313,7 +369,7 @@ def speed_windows(
             for value, end in zip(w.safe, w.interval.ends, strict=True)
         )
         lines.append(
-            f"  stable from {ends}; largest spectral radius {_from_one(w.largest)} at {speed} = {number(w.where)}"
+            f"  stable from {ends}; largest spectral radius {_from_one(w.largest)} at {asked.named(speed, w.where)}"
         )
         lines += [f"    {_checked(w.check)}"] if w.check else []
         places = zip(("lower", "upper"), (w.interval.lower_end, w.interval.upper_end), strict=True)
@@ -337,17 +393,83 @@ def speed_windows(
             }
             for w, effects in zip(found.windows, sensitivities, strict=True)
         ],
+        "unstable": [
+            {"range": [i.lower, i.upper], "physical": asked.physical({speed: (i.lower, i.upper)}), "resonance": word}
+            for i, word in zip(found.unstable, names, strict=True)
+        ],
         "undecided": [list(r) for r in found.undecided],
         **forced,
     }
     lines += [] if found.windows else [f"  none {_OPEN if found.undecided else 'within the atlas'}"]
     lines += _undecided(asked, speed, found.undecided)
-    return Reply(lines, data)
+    return Reply(lines, data, _where_unstable(asked, part, speed, found, names))
+
+
+def _where_unstable(
+    asked: AtlasQuery, part: Atlas, speed: str, found: design.Windows, names: Sequence[str | None]
+) -> str:
+    """The unstable ranges with the ``names`` of their resonances, and the damping that removes them, in one sentence."""
+    k = part.parameters.index(speed)
+    ends = float(part.lower[k]), float(part.upper[k])
+    whole = asked.span(speed, ends)
+    if not found.unstable:
+        return f"Stable at {whole}{_but_undecided(found.undecided)}."
+    if not found.windows and not found.undecided:
+        return f"Unstable at {whole}."
+    label = asked.shown(speed, ends[0])[0]
+    ranges = [
+        asked.span(speed, (i.lower, i.upper)).removeprefix(f"{label} = ") + (f" ({word})" if word else "")
+        for i, word in zip(found.unstable, names, strict=True)
+    ]
+    return f"Unstable at {label} = {_and(ranges)}{_removed(asked, part, speed, ends)}{_but_undecided(found.undecided)}."
+
+
+def _removed(asked: AtlasQuery, part: Atlas, speed: str, speeds: Range) -> str:
+    """The least damping that makes all ``speeds`` stable, as the end of a sentence; empty if the atlas does not tell."""
+    system = asked.atlas.scene.system
+    damping = system.roles.get("damping")
+    if damping not in part.parameters:
+        return ""
+    others = {name: value for name, value in asked.numbers().items() if name not in (speed, damping)}
+    answer = design.least_damping(part, system, speeds, others)
+    if answer.value is None or not answer.certain:
+        return ""
+    return f"; {asked.named(damping, _rounded(answer, 1.0))} or more removes this"
+
+
+def _rounded(answer: design.Answer, side: float) -> float:
+    """The value of an answer, moved to the safe ``side`` so far that six digits of it are safe."""
+    value = answer.value or 0.0
+    return value + side * (5e-6 * abs(value) + answer.error) if answer.limit else value
+
+
+def _resonance(asked: AtlasQuery, speed: str, interval: Interval) -> str | None:
+    """The predicted resonance nearest to an unstable ``interval``, whose multipliers leave the unit circle as it says."""
+    predicted, point = asked.atlas.scene.system.resonances, {**asked.atlas.fixed, **asked.numbers()}
+    if predicted is None or predicted.axis != speed or not point.keys() >= set(predicted.parameters):
+        return None
+    ways, values = {crossing.multiplier for crossing in interval.crossings}, predicted.values(point)
+    apart = np.maximum(np.maximum(interval.lower - values, values - interval.upper), 0) / values
+    fitting = [
+        (distance, f"{family.name.partition(' $')[0]} {label}")
+        for distance, label, way in zip(apart, predicted.labels, predicted.multipliers, strict=True)
+        if distance <= _NEAR and way in ways and (family := predicted.family(label)) and family.drawn
+    ]
+    return min(fitting)[1] if fitting else None
+
+
+def _and(words: Sequence[str]) -> str:
+    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
+
+
+def _but_undecided(ranges: Sequence[Range]) -> str:
+    """What errors leave open, as the end of a sentence."""
+    return f"; {len(ranges)} narrow range{'s are' if len(ranges) > 1 else ' is'} undecided" if ranges else ""
 
 
 def _undecided(asked: AtlasQuery, name: str, ranges: Iterable[Range]) -> list[str]:
     """Undecided ranges as text, with what to do."""
-    found = [f"  undecided from {asked.named(name, a)} to {asked.named(name, b)}" for a, b in ranges]
+    found = [f"  undecided: {asked.span(name, ends)}" for ends in ranges]
     remedy = (
         "  undecided ranges: `drivetrain point` solves a value there directly; a smaller rtol of the atlas narrows them"
     )
@@ -381,8 +503,9 @@ def _ends(asked: AtlasQuery, name: str, interval: Interval) -> list[dict[str, An
 
 def _bounded(asked: AtlasQuery, name: str, value: float, crossing: Crossing | None) -> str:
     """One end of a stable interval as text, with its error."""
-    bound = f" +- {crossing.error:.1e}" if crossing else BEYOND[_kind(asked, name, value, crossing)]
-    return asked.named(name, value) + bound
+    if crossing is None:
+        return asked.named(name, value) + BEYOND[_kind(asked, name, value, crossing)]
+    return asked.named(name, value, crossing.error)
 
 
 def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: design.Answer, amplitude: Any) -> Reply:
@@ -427,7 +550,24 @@ def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: des
         "check": _check(answer.check),
         **forced,
     }
-    return Reply(lines, data)
+    return Reply(lines, data, _extreme_sentence(title, asked, answer))
+
+
+def _extreme_sentence(title: str, asked: AtlasQuery, answer: design.Answer) -> str:
+    """The answer in one sentence."""
+    name, least = answer.parameter, title.startswith("least")
+    speed = asked.atlas.scene.system.roles["speed"]
+    label = asked.shown(name, answer.safe_end)[0]
+    speeds = asked.span(speed, asked.values[speed])
+    doubt = "" if answer.certain else " (not certain: some ranges are undecided)"
+    if answer.value is not None:
+        value = asked.named(name, _rounded(answer, 1.0 if least else -1.0))
+        return f"With {value} or {'more' if least else 'less'}, {speeds} is stable{doubt}."
+    if not answer.stable:
+        return f"{'No' if answer.certain else 'Perhaps no'} {label} of the atlas makes {speeds} stable."
+    ranges = _and([asked.span(name, (i.lower, i.upper)) for i in answer.stable])
+    end = f"the {'largest' if least else 'smallest'} {label} of the atlas"
+    return f"With {ranges}, {speeds} is stable, at {end} it is not{doubt}."
 
 
 def _elsewhere(safe: str, asked: AtlasQuery, answer: design.Answer) -> list[str]:
@@ -443,20 +583,23 @@ def _elsewhere(safe: str, asked: AtlasQuery, answer: design.Answer) -> list[str]
 
 def _nearest_lines(asked: AtlasQuery, nearest: design.Nearest) -> list[str]:
     sides = [_side(asked, nearest.parameter, nearest.value, c) for c in (nearest.below, nearest.above) if c]
-    lines = [f"  {nearest.parameter:<24} {'; '.join(sides) or _reach(asked.atlas, nearest)}"]
-    return lines + [f"  {'':<24} undecided from {number(a)} to {number(b)}" for a, b in nearest.undecided]
+    label = asked.shown(nearest.parameter, nearest.value)[0]
+    lines = [f"  {label:<24} {'; '.join(sides) or _reach(asked, nearest)}"]
+    return lines + [f"  {'':<24} undecided: {asked.span(nearest.parameter, ends)}" for ends in nearest.undecided]
 
 
 def _side(asked: AtlasQuery, name: str, value: float, crossing: Crossing) -> str:
+    _, here, _ = asked.shown(name, value)
+    _, there, units = asked.shown(name, crossing.value)
     where = "below" if crossing.value <= value else "above"
-    return f"{abs(crossing.value - value):.6g} {where}: {asked.named(name, crossing.value)} +- {crossing.error:.1e}"
+    place = asked.named(name, crossing.value, crossing.error)
+    return f"{number(abs(there - here))}{_unit(units)} {where}: {place}"
 
 
-def _reach(atlas: StoredAtlas, nearest: design.Nearest) -> str:
-    low, high = atlas.ranges[nearest.parameter]
+def _reach(asked: AtlasQuery, nearest: design.Nearest) -> str:
     # Stability may change inside an undecided range.
     elsewhere = ", except undecided ranges:" if nearest.undecided else ""
-    return f"none from {number(low)} to {number(high)}{elsewhere}"
+    return f"none within {asked.span(nearest.parameter, asked.atlas.ranges[nearest.parameter])}{elsewhere}"
 
 
 def _crossing(asked: AtlasQuery, name: str, crossing: Crossing | None) -> dict[str, Any] | None:

@@ -19,15 +19,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class Reply:
-    """An answer as ``lines`` of text, the first being the heading, and as plain numbers, words and lists (``data``)."""
+    """An answer in one sentence (empty if there is none), as ``lines`` of text, the first being the heading, and as plain
+    numbers, words and lists (``data``)."""
 
     lines: Sequence[str]
     data: Mapping[str, Any]
+    answer: str = ""
 
     @property
     def text(self) -> str:
         """The answer as ``print`` shows it."""
-        return "\n".join(self.lines)
+        return "\n".join([self.answer, *self.lines] if self.answer else self.lines)
 
     def __str__(self) -> str:
         return self.text
@@ -36,12 +38,13 @@ class Reply:
     __repr__ = __str__
 
     def to_json(self) -> str:
-        """``data`` as one JSON object; numbers that are not finite become null."""
-        return json.dumps(plain(self.data), allow_nan=False)
+        """``answer`` and ``data`` as one JSON object; numbers that are not finite become null."""
+        return json.dumps(plain({"answer": self.answer, **self.data} if self.answer else self.data), allow_nan=False)
 
     def sentences(self) -> list[str]:
-        """The lines below the heading as sentences."""
-        return [f"{line.strip()[:1].upper()}{line.strip()[1:]}." for line in self.lines[1:]]
+        """The answer, and the lines below the heading as sentences."""
+        lines = [f"{line.strip()[:1].upper()}{line.strip()[1:]}." for line in self.lines[1:]]
+        return [self.answer, *lines] if self.answer else lines
 
 
 def plain(value: Any) -> Any:
