@@ -21,7 +21,7 @@ from pathlib import Path
 from benchmarks.measure import RESULTS, parser, results_folder
 from benchmarks.page import PAGE, ROOT, write_page, write_pages
 from drivetrain_jax._wording import nearest
-from drivetrain_jax.cli.replies import WRONG_INPUT, one_line
+from drivetrain_jax.cli import WRONG_INPUT, one_line
 
 INTERRUPTED = 130
 # Studies by system: module and name of a table of contenders, or a module with a ``main``.

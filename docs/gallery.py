@@ -22,7 +22,7 @@ import xarray as xr
 import drivetrain_jax
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.cli.progress import progress_line
+from drivetrain_jax.cli import progress_line
 from drivetrain_jax.datasets.figure import table
 from drivetrain_jax.runs.atlas_chart import chart
 from drivetrain_jax.runs.output import status

@@ -15,9 +15,7 @@ import pytest
 import xarray as xr
 
 from drivetrain_jax import ChunkError, InputError, __version__
-from drivetrain_jax.cli import main
-from drivetrain_jax.cli.commands import _reading
-from drivetrain_jax.cli.progress import progress_line
+from drivetrain_jax.cli import _reading, main, progress_line
 from drivetrain_jax.runs.work import Progress
 from drivetrain_jax.systems import get_system
 from tests.sizes import full_after
@@ -261,7 +259,7 @@ WRONG_RUNS = {
         "not a result of",
     ),
     "result is the scene": (None, ["--out", "scene.toml", "--fresh"], "out = 'scene.toml': a result is a netCDF file"),
-    "name too long": (None, ["--out", "r" * 300], "--out: 'rrrr"),
+    "name too long": (None, ["--out", "r" * 300], "rrrr: File name too long"),
     "name of the parts too long": (None, ["--out", "r" * 252], "(with '.parts')"),
     "no folder can be made": (None, ["--out", "/proc/r.nc"], "a path in a writable folder"),
     "reuse of a foreign file": (
@@ -342,7 +340,7 @@ def test_wrong_run_is_one_line_and_writes_nothing(cli, folder, case):
         (("plot", "scene.toml", "--out", "f.xyz"), "allowed is a name that ends in ."),
         (("plot", ".", "--out", "f.png"), "'.': is a folder; give a result"),
         (("query", "r.nc", "a=true"), "a = True: allowed is a number or LOW:HIGH"),
-        (("plot", "r" * 300, "--out", "f.png"), "FILE.nc: 'rrrr"),
+        (("plot", "r" * 300, "--out", "f.png"), "rrrr: File name too long"),
     ],
 )
 def test_wrong_command_is_one_line(cli, folder, arguments, part):
@@ -420,7 +418,7 @@ def test_an_interrupt_while_all_is_loaded_counts_nothing(cli, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("drivetrain_jax.runs.run.load_scene", interrupted)
-    monkeypatch.setattr("drivetrain_jax.cli.commands.os._exit", sys.exit)
+    monkeypatch.setattr("drivetrain_jax.cli.os._exit", sys.exit)
     counts = "points: total=0 computed=0 reused=0 failed=0"
     line = "drivetrain: interrupted; the same command resumes"
     assert cli("run", "scene.toml", "--out", "r.nc") == (130, "", [line, counts])

@@ -11,7 +11,7 @@ from contextlib import suppress
 
 import pytest
 
-from drivetrain_jax.cli.commands import _stop_on_signals
+from drivetrain_jax.cli import _stop_on_signals
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
 

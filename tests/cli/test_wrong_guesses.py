@@ -18,8 +18,7 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax import _units
-from drivetrain_jax.cli import main
-from drivetrain_jax.cli.arguments import parser
+from drivetrain_jax.cli import main, parser
 
 SCENE = """
 system = "cardan"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from drivetrain_jax.cli.arguments import parser
+from drivetrain_jax.cli import parser
 from drivetrain_jax.runs.scene import load_scene
 
 pytestmark = pytest.mark.docs

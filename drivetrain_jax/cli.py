@@ -1,0 +1,643 @@
+"""The command ``drivetrain``: its arguments and the functions of its commands.
+
+Heavy imports are local, so ``--help`` is fast and each command loads only its own modules.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import io
+import os
+import re
+import signal
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from drivetrain_jax import __version__, _units
+from drivetrain_jax._errors import ChunkError, InputError
+
+if TYPE_CHECKING:
+    from drivetrain_jax.runs.run import Progress
+
+__all__ = ["main"]
+
+OK, WRONG_INPUT, INCOMPLETE, INTERRUPTED = 0, 2, 3, 130
+_FIGURES = (".png", ".pdf", ".svg")
+# Tables of constants, and their separators.
+_TABLES = {".txt": "", ".csv": ","}
+_PAGES = (".html", ".htm")
+# Time [s] after a signal during which further signals are ignored.
+_GRACE = 2.0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code: 0 done, 2 wrong input, 3 incomplete and resumable, 130 interrupted."""
+    if arguments is None:
+        # Collect garbage rarely: the default takes a third of a second and frees little, as most objects live until the end.
+        gc.set_threshold(50_000)
+        # Figures are written to files, so a window system of the user's choice is not needed, and may be missing.
+        os.environ["MPLBACKEND"] = "agg"
+        # A warning of a value, without the line of code that found it.
+        warnings.formatwarning = lambda message, *_, **__: one_line(f"warning: {message}")
+        # Ctrl-C ends a command at once, also during a compilation; ``run`` has a handler of its own.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            # The parent process has closed this stream, so no one reads its output.
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+    options = parser().parse_args(arguments)
+    try:
+        return options.command(options)
+    except (InputError, ChunkError) as error:
+        sys.stderr.write(one_line(str(error)))
+        return INCOMPLETE if isinstance(error, ChunkError) else WRONG_INPUT
+    except BrokenPipeError:
+        # The reader has closed standard output (``drivetrain list | head``): exit without a message.
+        _drop_output()
+        return OK
+    except OSError as error:
+        if error.filename is None:
+            raise
+        sys.stderr.write(one_line(f"{error.filename}: {error.strerror}"))
+        return WRONG_INPUT
+    except (RuntimeError, AssertionError):
+        if (text := _backend_error()) is None:
+            raise
+        sys.stderr.write(one_line(text))
+        return WRONG_INPUT
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    finally:
+        if arguments is None:
+            # Skip Python's garbage collection at exit, which takes a third of a second.
+            gc.freeze()
+
+
+def one_line(message: str) -> str:
+    """``message`` on one line, with the name of the command in front."""
+    return f"drivetrain: {' '.join(message.split())}\n"
+
+
+def _say(text: str) -> None:
+    """Print ``text`` on standard output; if that fails (a full disk), raise :class:`InputError`."""
+    encoding = sys.stdout.encoding or "utf-8"
+    try:
+        # The encoding of a terminal may lack characters of a title.
+        sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding))
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        _drop_output()
+        raise InputError(f"standard output: {error.strerror}; allowed is one that can be written") from None
+
+
+def _drop_output() -> None:
+    """Discard buffered output; otherwise Python would try to write it again at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _backend_error() -> str | None:
+    """The message if jax cannot use the machines that ``JAX_PLATFORMS`` names; None if it can."""
+    wanted = os.environ.get("JAX_PLATFORMS")
+    if not wanted or "jax" not in sys.modules:
+        return None
+    try:
+        sys.modules["jax"].devices()
+    # jax raises either, depending on the name.
+    except (RuntimeError, AssertionError):
+        allowed = "allowed is cpu, or to unset the variable"
+        return f"JAX_PLATFORMS = {wanted!r}: jax cannot use it on this machine; {allowed}"
+    return None
+
+
+# Arguments.
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose usage errors are one line, with the exit code for wrong input."""
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Parse; values ``name=value`` may follow options, which argparse itself does not allow."""
+        options, unknown = self.parse_known_args(args, namespace)
+        if "given" in options:
+            options.given = [*options.given, *(word for word in unknown if "=" in word and not word.startswith("-"))]
+            unknown = [word for word in unknown if word not in options.given]
+        if unknown:
+            options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return options
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(WRONG_INPUT, one_line(f"{message}; see {self.prog} --help"))
+
+
+def number(text: str) -> float:
+    """A part of a whole, such as 0.02 or 2%."""
+    return _units.number(text, "1") if text.endswith("%") else float(text)
+
+
+def path(text: str) -> Path:
+    """A path; the shell leaves the ~ of --out=~/r.nc alone."""
+    return Path(text).expanduser()
+
+
+# An argument as :meth:`argparse.ArgumentParser.add_argument` takes it.
+Argument = tuple[str, dict[str, Any]]
+
+
+def _value(name: str, metavar: str, text: str, **options: Any) -> Argument:
+    return name, {"metavar": metavar, "help": text, **options}
+
+
+def _file(name: str, metavar: str, text: str, **options: Any) -> Argument:
+    return _value(name, metavar, text, type=path, **options)
+
+
+def _given(text: str) -> Argument:
+    # The default keeps argparse from reporting it as required.
+    return _value("given", "name=value", text, nargs="*", default=[])
+
+
+_JSON: Argument = "--json", {"action": "store_true", "help": "as one JSON object"}
+_ATLAS = _file("file", "FILE.nc", 'result of a scene with analysis = "atlas"')
+_DATA = _file(
+    "--data", "TABLE", "table of parameters (.csv, .xlsx), a column each: length [mm]; given values override it"
+)
+_AMPLITUDE = _value(
+    "--amplitude", "LIMIT", 'limit of the forced amplitude ("2 deg"), to compare the forced motion with'
+)
+_SCENE = (
+    _file("scene", "SCENE.toml", "scene file, or a name of `drivetrain list`"),
+    _file("--out", "FILE.nc", "result file", required=True),
+    _value("--set", "KEY=VALUE", "replace an entry of the scene: fixed.zeta=0.002", action="append", default=[]),
+    _DATA,
+)
+_QUESTIONS = ("least-damping", "widest-angle", "speed-windows")
+
+# The text of every command, and its arguments; the function has the name of the command.
+_COMMANDS: dict[str, tuple[str, tuple[Argument, ...]]] = {
+    "list": ("list systems, analyses, parameters and scenes", (
+        _value("system", "SYSTEM", "describe this system", nargs="?"),
+    )),
+    "run": ("compute a scene, or resume an interrupted run", (
+        *_SCENE,
+        ("--fresh", {"action": "store_true", "help": "compute all points again; replace result and unfinished work"}),
+        _value("--threads", "N", "number of threads (default: usable cores)", type=int),
+        _value("--workers", "N", "N Dask workers instead of threads, as --dask local:N; a worker may crash", type=int),
+        _value("--dask", "ADDRESS", "Dask cluster instead of threads: tcp://HOST:PORT or local:N"),
+        _file("--reuse", "FILE.nc", "reuse the common points of this result; a smaller result at --out is always reused",
+              action="append", default=[]),
+        ("--store", {"choices": ("hdf5", "zarr"), "help": "zarr: workers write a Zarr store (default if so named)"}),
+        ("--quiet", {"action": "store_true", "help": "print only the last line"}),
+    )),
+    "status": ("show how much of a scene is computed", (*_SCENE, _JSON)),
+    "verify": ("compare all checksums of a result, and apply the rules of its analysis", (
+        _file("file", "FILE.nc", "result, finished or not"), _JSON,
+    )),
+    "export": ("write a Zarr store as one HDF5 file, or a result as CSV", (
+        _file("store", "RESULT", "a Zarr store, or with --csv any result on a grid"),
+        _file("file", "FILE.nc", "HDF5 file to write", nargs="?"),
+        _value("--csv", "TABLE.csv", nargs="?", const="",
+               text="write a table (default: RESULT.csv): one row a point, units in the header, codes as words"),
+    )),
+    "plot": ("draw the figure of a result", (
+        _file("files", "FILE.nc", "results; overlaid: methods of one analysis, or a chart and its atlas", nargs="+"),
+        _file("--out", "FIGURE", "figure (.png, .pdf, .svg) or table of constants (.txt, .csv)", required=True),
+        _value("--part", "name=LOW:HIGH", "part of an atlas: ranges, or name=value", nargs="+", default=[]),
+        _value("--cells", "N", "cells per axis for an atlas (default: 800)", type=int),
+        _value("--units", "rpm,deg", "units of the axes (default: those of the scene)"),
+    )),
+    "report": ("write a report on results: one HTML file that prints well", (
+        _file("files", "FILE.nc", "results, one section each", nargs="+"),
+        _file("--out", "REPORT.html", "page to write", required=True),
+        _value("--title", "TEXT", "heading (default: the title of the scene)"),
+        _value("--units", "rpm,deg", "units of the report (default: those of the scenes)"),
+        _AMPLITUDE,
+    )),
+    "point": ("compute one point", (
+        _value("system", "SYSTEM", "name from `drivetrain list`"),
+        _value("analysis", "ANALYSIS", "name from `drivetrain list SYSTEM`"),
+        _given("parameters in the units of `drivetrain list SYSTEM`, options, and outputs=NAME,NAME"),
+        _DATA, _AMPLITUDE,
+        ("--sensitivities", {
+            "action": "store_true", "help": "add those of the spectral radius, largest effect of 1 %% first",
+        }),
+        _JSON,
+    )),
+    "query": ("evaluate a stored atlas at one point", (
+        _ATLAS, _given("parameters, or physical data"), _AMPLITUDE, _JSON,
+    )),
+    "design": ("answer a design question from a stored atlas", (
+        _value("question", "QUESTION", ", ".join(_QUESTIONS), choices=_QUESTIONS),
+        _ATLAS, _given("parameters; a range is name=LOW:HIGH"), _AMPLITUDE,
+        _value("--margin", "PART", "speed-windows: relative distance in speed from every boundary", type=number),
+        _JSON,
+    )),
+    "explore": ("write a page that evaluates a stored atlas in a browser", (
+        _ATLAS, _file("--out", "PAGE.html", "page to write (.html)", required=True),
+    )),
+    "bench": ("measure error and run time, compared with peers (source checkout only)", (
+        _value("systems", "SYSTEM", "only the studies of these systems", nargs="*", default=[]),
+        ("--quick", {"action": "store_true", "help": "small versions (minutes); do not change the stored results"}),
+        _file("--out", "FOLDER", "output folder"),
+    )),
+}  # fmt: skip
+
+
+def parser() -> argparse.ArgumentParser:
+    """The parser of all commands; the result has the function of the command as ``command``."""
+    whole = _Parser(
+        prog="drivetrain",
+        description="Compute stability and vibration of drivetrains, and draw the results.",
+        epilog="Start with `drivetrain list`. `drivetrain COMMAND --help` describes a command.",
+        allow_abbrev=False,
+    )
+    whole.add_argument("--version", action="version", version=__version__)
+    subparsers = whole.add_subparsers(metavar="COMMAND", required=True)
+    for name, (text, arguments) in _COMMANDS.items():
+        described = f"{text[0].upper()}{text[1:]}."
+        command = subparsers.add_parser(name, help=text, description=described, allow_abbrev=False)
+        command.set_defaults(command=globals()["list_systems" if name == "list" else name], parser=command)
+        for argument, options in arguments:
+            command.add_argument(argument, **options)
+    return whole
+
+
+def assignments(texts: Sequence[str], field: str) -> dict[str, Any]:
+    """A mapping from ``name=value`` words; values are TOML or plain text."""
+    from drivetrain_jax.runs.toml import parse_value
+
+    pairs: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if not (name and equals and value):
+            raise InputError(f"{field} = {text!r}: allowed is name=value")
+        if name in pairs:
+            raise InputError(f"{field} = {text!r}: {name} is given twice; allowed is once")
+        pairs[name] = parse_value(value)
+    for name in pairs:
+        if table := next((other for other in pairs if name.startswith(f"{other}.")), None):
+            raise InputError(f"{field} = {name!r}: it is part of {table!r}, which is given too; allowed is one of them")
+    return pairs
+
+
+def ranges(texts: Sequence[str], field: str) -> dict[str, Any]:
+    """A mapping from ``name=value`` words; values are numbers or pairs ``LOW:HIGH``, texts if they have units."""
+    return {name: _number_or_range(name, value) for name, value in assignments(texts, field).items()}
+
+
+def _number_or_range(name: str, value: Any) -> Any:
+    if isinstance(value, str):
+        ends = [_units.split(end) for end in value.split(":")]
+        known = [end for end in ends if end is not None]
+        # 1000-2000 is no number, and its second half no unit.
+        if len(known) == len(ends) <= 2 and not any(re.match(r"[-.,\d]", unit) for _, unit in known):
+            # 0:18deg is a range in degrees.
+            units = [unit or known[-1][1] for _, unit in known]
+            numbers = [f"{end!r} {unit}" if unit else end for (end, _), unit in zip(known, units, strict=True)]
+            return numbers[0] if len(numbers) == 1 else tuple(numbers)
+    elif isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    raise InputError(f"{name} = {value!r}: allowed is a number or LOW:HIGH, with or without units (200:4000rpm)")
+
+
+# Commands.
+
+
+def list_systems(options: argparse.Namespace) -> int:
+    """Print all systems, or one system in detail."""
+    from drivetrain_jax.runs.catalogue import describe, overview
+
+    _say(describe(options.system) if options.system else overview())
+    return OK
+
+
+def _answer(reply: Any, options: argparse.Namespace) -> int:
+    _say((reply.to_json() if options.json else str(reply)) + "\n")
+    return OK
+
+
+def run(options: argparse.Namespace) -> int:
+    """Compute or resume a scene. Ctrl-C and SIGTERM stop it; finished blocks are kept."""
+    with _stop_on_signals() as check:
+        try:
+            progress, code, reason = _compute(options, check)
+        except KeyboardInterrupt as stop:
+            # Before the modules are loaded no point is counted.
+            progress = getattr(stop, "progress", "points: total=0 computed=0 reused=0 failed=0")
+            code, reason = INTERRUPTED, "interrupted; the same command resumes"
+        if reason:
+            sys.stderr.write(one_line(reason))
+        sys.stderr.write(f"{progress}\n")
+        if code == INTERRUPTED:
+            # A normal exit would wait for running chunks, whose results are not needed.
+            sys.stderr.flush()
+            os._exit(code)
+    return code
+
+
+def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[Any, int, str]:
+    """Counts, exit code, and the message for the user: a note, and the values that miss the tolerance."""
+    from drivetrain_jax.runs.output import missed
+    from drivetrain_jax.runs.run import Incomplete, run_to_file
+    from drivetrain_jax.runs.work import make_executor
+
+    overrides = _overrides(options)
+    with nullcontext() if options.quiet else progress_line() as show:
+
+        def report(progress: Progress) -> None:
+            check()
+            if show:
+                show(progress)
+
+        try:
+            progress = run_to_file(
+                options.scene,
+                options.out,
+                overrides=overrides,
+                fresh=options.fresh,
+                executor=make_executor(options.threads, options.workers, options.dask),
+                reuse=options.reuse,
+                store=options.store,
+                report=report,
+            )
+        except Incomplete as error:
+            return error.progress, INCOMPLETE, str(error)
+    if options.quiet:
+        return progress, OK, ""
+    lost = missed(options.out, progress.inaccurate, progress.total) if progress.inaccurate else ""
+    return progress, OK, "; ".join(filter(None, (progress.note, lost)))
+
+
+@contextmanager
+def _stop_on_signals() -> Iterator[Callable[[], None]]:
+    """Raise ``KeyboardInterrupt`` on Ctrl-C and SIGTERM inside the context.
+
+    Yields a function that raises it again after a signal, because a destructor or a C callback may swallow the first one;
+    nothing is printed then. Further signals are ignored for two seconds, so that finished chunks are written.
+    """
+    caught: list[float] = []
+    report_unraisable = sys.unraisablehook
+
+    def check() -> None:
+        if caught:
+            raise KeyboardInterrupt
+
+    def stop(*_: object) -> None:
+        caught.append(time.monotonic())
+        if len(caught) == 1 or caught[-1] - caught[0] > _GRACE:
+            raise KeyboardInterrupt
+
+    def report(swallowed: Any) -> None:
+        if swallowed.exc_type is not KeyboardInterrupt:
+            report_unraisable(swallowed)
+
+    handlers = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    sys.unraisablehook = report
+    try:
+        yield check
+    finally:
+        sys.unraisablehook = report_unraisable
+        for number, handler in handlers.items():
+            # A handler that Python did not set cannot be restored.
+            signal.signal(number, handler or signal.SIG_DFL)
+
+
+def _overrides(options: argparse.Namespace) -> dict[str, Any]:
+    """Entries of the scene that the command line replaces."""
+    return {f"fixed.{name}": value for name, value in _tabulated(options).items()} | assignments(options.set, "--set")
+
+
+def _tabulated(options: argparse.Namespace) -> dict[str, Any]:
+    """The values of the table ``--data``."""
+    if options.data is None:
+        return {}
+    from drivetrain_jax.runs.physical import read_table
+
+    return read_table(options.data)
+
+
+def status(options: argparse.Namespace) -> int:
+    """Print how much of a scene is computed."""
+    from drivetrain_jax.runs.output import status
+
+    return _answer(status(options.scene, options.out, _overrides(options)), options)
+
+
+def verify(options: argparse.Namespace) -> int:
+    """Verify the checksums and rules of a result; a damaged result is wrong input."""
+    from drivetrain_jax.invariants import verify
+
+    report = verify(options.file)
+    _answer(report, options)
+    if report.problem:
+        raise InputError(f"file = {str(options.file)!r}: {report.problem}")
+    return OK if report.complete else INCOMPLETE
+
+
+def export(options: argparse.Namespace) -> int:
+    """Write a Zarr store as one HDF5 file, or a result as a table."""
+    if options.csv is not None:
+        from drivetrain_jax.datasets.accessor import write_csv
+
+        if options.file:
+            raise InputError(f"FILE.nc = {str(options.file)!r}: not used with --csv; allowed is --csv TABLE.csv")
+        out = Path(options.csv or options.store.with_suffix(".csv"))
+        _check_place(out, (".csv",))
+        count = write_csv(options.store, out)
+    elif options.file is None:
+        raise InputError("FILE.nc: missing; allowed is a new file, or --csv for a table")
+    else:
+        from drivetrain_jax.runs.stores import export
+
+        count = export(options.store, options.file)
+    sys.stderr.write(f"points: {count} exported\n")
+    return OK
+
+
+def plot(options: argparse.Namespace) -> int:
+    """Draw the figure of one result or of several results together, or write a table of constants."""
+    from drivetrain_jax.datasets.figure import plot, table
+    from drivetrain_jax.store.checksums import refuse_damaged
+
+    _check_place(options.out, (*_FIGURES, *_TABLES))
+    ending, image = options.out.suffix.lower(), io.BytesIO()
+    part = ranges(options.part, "--part") or None
+    if ending in _TABLES and (len(options.files) > 1 or part or options.cells is not None):
+        raise InputError(f"out = {str(options.out)!r}: a table shows one whole result; allowed are figures")
+    with _reading(*options.files):
+        if ending in _TABLES:
+            return _write(options.out, table(options.files[0], options.units, _TABLES[ending]).encode())
+        try:
+            figure = plot(options.files, part=part, cells=options.cells, units=options.units)
+        except InputError:
+            raise
+        except (LookupError, ValueError):
+            # What another program has changed may be why the figure failed.
+            for file in options.files:
+                refuse_damaged(file, rewritten=True)
+            raise
+        figure.savefig(image, format=ending[1:])
+    return _write(options.out, image.getbuffer())
+
+
+def report(options: argparse.Namespace) -> int:
+    """Write one HTML file about results."""
+    _check_place(options.out, _PAGES)
+    from drivetrain_jax.report import report
+
+    with _reading(*options.files):
+        page = report(options.files, options.title, options.units, options.amplitude)
+    return _write(options.out, page.encode())
+
+
+def explore(options: argparse.Namespace) -> int:
+    """Write the explorer's page of an atlas."""
+    from drivetrain_jax.runs.atlas_file import open_atlas
+
+    _check_place(options.out, _PAGES)
+    with _reading(options.file):
+        page = open_atlas(options.file).explore().text
+    return _write(options.out, page.encode())
+
+
+def _check_place(out: Path, endings: tuple[str, ...]) -> None:
+    """Raise :class:`InputError` for a file that could not be written, before anything is computed."""
+    if not out.parent.is_dir():
+        raise InputError(f"out = {str(out)!r}: the folder does not exist; allowed is a file in an existing folder")
+    if out.exists() and not out.is_file():
+        what = "is a folder" if out.is_dir() else "not a regular file"
+        raise InputError(f"out = {str(out)!r}: {what}; allowed is a new file, or one to replace")
+    if out.suffix.lower() not in endings:
+        raise InputError(f"out = {str(out)!r}: allowed is a name that ends in {', '.join(endings)}")
+
+
+def _write(out: Path, data: bytes | memoryview) -> int:
+    from drivetrain_jax.store.files import write_atomic
+
+    write_atomic(out, data, out.with_name(f"{out.name}.tmp"))
+    return OK
+
+
+def point(options: argparse.Namespace) -> int:
+    """Print the results of one point."""
+    from drivetrain_jax.runs.point import point
+
+    given = _tabulated(options) | assignments(options.given, "point")
+    for name in ("system", "analysis"):
+        if name in given:
+            raise InputError(f"{name} = {given[name]!r}: given twice; allowed is once, in front of the values")
+    for name in ("amplitude", "sensitivities"):
+        if name in given:
+            raise InputError(f"{name} = {given[name]!r}: not a parameter; did you mean the option --{name}?")
+    outputs = given.pop("outputs", None)
+    if isinstance(outputs, str):
+        outputs = outputs.split(",")
+    asked = {"amplitude": options.amplitude, "sensitivities": options.sensitivities}
+    return _answer(point(options.system, options.analysis, outputs=outputs, **asked, **given), options)
+
+
+def query(options: argparse.Namespace) -> int:
+    """Print the values of an atlas at one point."""
+    from drivetrain_jax.runs.atlas_answers import query
+    from drivetrain_jax.runs.atlas_file import open_atlas
+
+    given = ranges(options.given, "query")
+    with _reading(options.file):
+        reply = query(open_atlas(options.file), given, options.amplitude)
+    return _answer(reply, options)
+
+
+def design(options: argparse.Namespace) -> int:
+    """Print the answer of an atlas to a design question."""
+    from drivetrain_jax.runs import atlas_answers
+    from drivetrain_jax.runs.atlas_file import open_atlas
+
+    extra = {} if options.margin is None else {"margin": options.margin}
+    if extra and options.question != "speed-windows":
+        raise InputError(f"--margin = {options.margin}: not used by {options.question}; allowed for speed-windows")
+    given = ranges(options.given, "design")
+    question = getattr(atlas_answers, options.question.replace("-", "_"))
+    with _reading(options.file):
+        reply = question(open_atlas(options.file), given, amplitude=options.amplitude, **extra)
+    return _answer(reply, options)
+
+
+def bench(options: argparse.Namespace) -> int:
+    """Run the benchmarks of a checkout in a separate process."""
+    import subprocess
+
+    checkout = Path(__file__).resolve().parents[1]
+    if not (checkout / "benchmarks" / "__main__.py").is_file():
+        raise InputError(f"bench: no folder benchmarks/ in {str(checkout)!r}; allowed is a checkout")
+    words = [*options.systems, *(["--quick"] if options.quick else [])]
+    words += ["--out", str(options.out.absolute())] if options.out else []
+    return subprocess.run([sys.executable, "-m", "benchmarks", *words], cwd=checkout, check=False).returncode
+
+
+# Progress on standard error.
+
+
+@contextmanager
+def progress_line() -> Iterator[Callable[[Progress], None]]:
+    """Show a progress bar; yields the function that updates it. Its length is the predicted cost of the finished points."""
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    columns = BarColumn(), TextColumn("{task.fields[counts]}"), TimeElapsedColumn(), TextColumn("left")
+    bar = Bar(*columns, TimeRemainingColumn(), console=Console(stderr=True))
+    task = bar.add_task("", total=None, counts="compiling")
+    begin = time.monotonic()
+
+    def report(progress: Progress) -> None:
+        # Started at the first report, because wrong input must print a single line.
+        bar.start()
+        done = progress.computed + progress.reused
+        rate = progress.computed / max(time.monotonic() - begin, 1e-9)
+        counts = f"{done}/{progress.total} {progress.kind}, {rate:.3g}/s" if progress.cost or done else "compiling"
+        bar.update(task, total=progress.total_cost, completed=progress.cost, counts=counts + progress.exceptions)
+
+    try:
+        yield report
+    except InputError:
+        # Remove the bar if the run fails on wrong input, such as a scheduler that does not answer.
+        bar.live.transient = True
+        bar.live.stop()
+        raise
+    finally:
+        if bar.live.is_started:
+            bar.stop()
+
+
+def _reading(*files: Path) -> ExitStack:
+    """A context that shows a moving sign, these files and the time on a terminal, and removes them at the end."""
+    stack = ExitStack()
+    if not sys.stderr.isatty():
+        return stack
+    from rich.console import Console
+    from rich.progress import Progress as Bar
+    from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    if not console.is_interactive:
+        return stack
+    # Ctrl-C ends the process at once, and nothing would show a hidden cursor again.
+    console.show_cursor = lambda show=True: False
+    columns = SpinnerColumn("line"), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
+    # Answers must go to standard output even while the sign is shown.
+    bar = Bar(*columns, console=console, transient=True, redirect_stdout=False, redirect_stderr=False)
+    first, *more = [file.name for file in files]
+    bar.add_task(f"{first} and {len(more)} more" if more else first, total=None)
+    stack.enter_context(bar)
+    return stack
+
+
+if __name__ == "__main__":
+    sys.exit(main())
