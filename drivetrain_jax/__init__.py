@@ -8,12 +8,12 @@ scene file, ``point`` one parameter set. Wrong input raises ``InputError``. A fa
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._errors import ChunkError, InputError
 from drivetrain_jax._precision import use_double_precision
-from drivetrain_jax._registration import register_accessor
 
 if TYPE_CHECKING:
     from drivetrain_jax.analyses import (
@@ -103,5 +103,42 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
+def _register_accessor() -> None:
+    """Give every Dataset of xarray, which is imported, the accessor ``drivetrain``."""
+    xr = sys.modules["xarray"]
+    if not hasattr(xr.Dataset, "drivetrain"):
+        accessor = import_module(f"{__name__}.datasets.accessor").DrivetrainAccessor
+        xr.register_dataset_accessor("drivetrain")(accessor)
+
+
+class _AfterXarray:
+    """Import finder that leaves xarray to the other finders, and registers the accessor after its import.
+
+    It does not inherit from :class:`importlib.abc.MetaPathFinder`, whose import takes longer than that of this package.
+    """
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:
+        """The specification of xarray; None for every other module."""
+        if name != "xarray" or self not in sys.meta_path:
+            return None
+        from importlib.util import find_spec
+
+        sys.meta_path.remove(self)
+        spec = find_spec(name)
+        if spec is not None and spec.loader is not None:
+            execute = spec.loader.exec_module
+
+            def execute_and_register(module: Any) -> None:
+                execute(module)
+                _register_accessor()
+
+            spec.loader.exec_module = execute_and_register
+        return spec
+
+
 use_double_precision()
-register_accessor()
+# This package alone does not import xarray.
+if "xarray" in sys.modules:
+    _register_accessor()
+else:
+    sys.meta_path.insert(0, _AfterXarray())

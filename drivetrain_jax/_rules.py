@@ -105,12 +105,6 @@ class Declared:
             raise TypeError(f"rules: got {shown(self.rules)}; allowed is a tuple of rules, (rule, ...)")
 
 
-ATLAS = Declared(
-    (in_order("lower", "upper"), in_order("panel_lower", "panel_upper"), within("panel_degrees", 1.0)),
-    has_points=False,
-)
-
-
 # Error of a radius that is known to be 1: four roundings.
 _ROUNDING = 1e-15
 
@@ -143,35 +137,6 @@ def _verdict(ds: xr.Dataset) -> xr.DataArray:
     return (stable != (verdict == 0)) | (unstable & (verdict != 1)) | ((rho + error <= 1) & (verdict == 1))
 
 
-FLOQUET = Declared(
-    (
-        ordered("floquet_multiplier", "multiplier", falling=True, key=abs),
-        relation(
-            "spectral_radius is the largest modulus of floquet_multiplier",
-            ("spectral_radius", "floquet_multiplier"),
-            _all_multipliers(lambda top, ds: abs(top - ds["spectral_radius"]) > 1e-9 * top),
-        ),
-        relation(
-            "verdict follows from spectral_radius and its bound",
-            ("verdict", "spectral_radius", "spectral_radius_error"),
-            _verdict,
-        ),
-        relation(
-            "liouville_residual lies within the bound of spectral_radius",
-            ("liouville_residual", "spectral_radius", "spectral_radius_error"),
-            _liouville,
-        ),
-        within("spectral_radius", 0.0),
-    ),
-    gaps=("floquet_multiplier", "floquet_multiplier_error", "floquet_exponent"),
-)
-
-
-FORCED = Declared(
-    (within("amplitude", 0.0), within("condition", 1.0), within("orbit_amplitude", 0.0)), kept=("condition",)
-)
-
-
 def _rms_too_large(ds: xr.Dataset) -> xr.DataArray:
     largest = xr.where(abs(ds["u_max"]) > abs(ds["u_min"]), abs(ds["u_max"]), abs(ds["u_min"]))
     return ds["u_rms"] > largest * (1 + 1e-9)
@@ -184,18 +149,6 @@ MOTION = (
     within("spectral_radius", 0.0),
     within("period_multiple", 0.0),
     relation("u_rms <= max |u|", ("u_rms", "u_max", "u_min"), _rms_too_large),
-)
-
-STEADY_STATE = Declared(
-    (
-        *MOTION,
-        in_order("u_min", "u_mean", "u_max"),
-        within("impacts", 0.0),
-        within("contact_fraction", 0.0, 1.0),
-    ),
-    # NaN is allowed: a motion that never repeats has no multipliers, a motion at rest has no phase, and a spectral radius
-    # that underflows has no exponent.
-    gaps=("phase", "spectral_radius", "floquet_multiplier", "lyapunov_exponent", "state_error"),
 )
 
 
@@ -215,53 +168,6 @@ def _stability_differs(ds: xr.Dataset) -> xr.DataArray:
     return wrong | ((stability == 2) != radius.isnull())
 
 
-FREQUENCY_RESPONSE = Declared(
-    (
-        *MOTION,
-        in_order("branch_u_min", "branch_u_max"),
-        within("branch_amplitude", 0.0),
-        within("branch_spectral_radius", 0.0),
-        relation("largest branch_amplitude rises along branch", ("branch_amplitude", "outcome"), _branches_fall),
-        relation(
-            "branch_stability follows from branch_spectral_radius",
-            ("branch_stability", "branch_spectral_radius"),
-            _stability_differs,
-        ),
-        ordered("fold_frequency", "fold"),
-        ordered("doubling_frequency", "doubling"),
-    ),
-    # NaN is allowed: the dimensions of branches and folds are longer than most points need, a motion at rest has no phase,
-    # and some frequencies have no backbone.
-    gaps=(
-        "phase",
-        "branch_u_max",
-        "branch_u_min",
-        "branch_amplitude",
-        "branch_spectral_radius",
-        "fold_frequency",
-        "doubling_frequency",
-        "backbone_amplitude",
-        "peak_amplitude",
-        "peak_frequency",
-        "spectral_radius",
-        "state_error",
-    ),
-    kept=("fit_range",),
-)
-
-
-BASINS = Declared(
-    (
-        within("basin_fraction", 0.0, 1.0),
-        sums_to_one("basin_fraction", "attractor", ("unsettled_fraction",)),
-        in_order("attractor_u_min", "attractor_u_max"),
-    ),
-    # NaN is allowed: results hold up to eight attractors, and most points have fewer.
-    gaps=("basin_fraction", "basin_error", "attractor_u_max", "attractor_u_min"),
-    kept=("unsettled_fraction",),
-)
-
-
 # Largest residual if all exponents are nearly zero [1/s]: volume changes by rounding and steps.
 _VOLUME_RATE = 1e-9
 
@@ -272,66 +178,132 @@ def _sum_rule(ds: xr.Dataset) -> xr.DataArray:
     return (abs(ds["sum_rule_residual"]) > allowed) & (ds["outcome"] == 0)
 
 
-LYAPUNOV = Declared(
-    (
-        ordered("lyapunov_spectrum", "exponent", falling=True),
-        relation("the exponents sum to the mean divergence", ("sum_rule_residual", "lyapunov_spectrum"), _sum_rule),
-        within("chaos_k01", -1.0, 1.0),
-        within("period_multiple", 0.0),
-    ),
-    # NaN is allowed: an unbounded motion has only exponents, and the history of a run ends where it converged.
-    gaps=(
-        "lyapunov_standard_error",
-        "lyapunov_history",
-        "sum_rule_residual",
-        "paper_estimator",
-        "chaos_k01",
-    ),
-)
-
-
-POINCARE = Declared(
-    (within("distinct_points", 0.0), within("chaos_k01", -1.0, 1.0)),
-    # K is undefined for a short section that does not repeat.
-    gaps=("chaos_k01",),
-)
-
-
-MODES = Declared(
-    (
-        ordered("natural_frequency", "mode"),
-        within("natural_frequency", 0.0),
-        within("participation", 0.0, 1.0),
-        sums_to_one("participation", "family"),
-        within("dominant_share", 0.0, 1.0),
-        within("kinetic_energy", 0.0, 1.0),
-        sums_to_one("kinetic_energy", "body"),
-        within("mac", 0.0, 1.0),
-    )
-)
-
-
-CRITICAL_SPEEDS = Declared(
-    (
-        ordered("natural_frequency", "mode"),
-        within("natural_frequency", 0.0),
-        multiple("angular_frequency", 2 * math.pi, "natural_frequency"),
-        multiple("critical_speed", 60.0, "natural_frequency"),
-        within("count_certified", 0.0, 1.0),
-        within("mode_shape", -1.0, 1.0),
-    )
-)
-
 # Rules of the analyses of this package by name.
 BUILT_IN = {
-    "atlas": ATLAS,
-    "floquet": FLOQUET,
-    "forced": FORCED,
-    "steady_state": STEADY_STATE,
-    "frequency_response": FREQUENCY_RESPONSE,
-    "basins": BASINS,
-    "lyapunov": LYAPUNOV,
-    "poincare": POINCARE,
-    "modes": MODES,
-    "critical_speeds": CRITICAL_SPEEDS,
+    "atlas": Declared(
+        (in_order("lower", "upper"), in_order("panel_lower", "panel_upper"), within("panel_degrees", 1.0)),
+        has_points=False,
+    ),
+    "floquet": Declared(
+        (
+            ordered("floquet_multiplier", "multiplier", falling=True, key=abs),
+            relation(
+                "spectral_radius is the largest modulus of floquet_multiplier",
+                ("spectral_radius", "floquet_multiplier"),
+                _all_multipliers(lambda top, ds: abs(top - ds["spectral_radius"]) > 1e-9 * top),
+            ),
+            relation(
+                "verdict follows from spectral_radius and its bound",
+                ("verdict", "spectral_radius", "spectral_radius_error"),
+                _verdict,
+            ),
+            relation(
+                "liouville_residual lies within the bound of spectral_radius",
+                ("liouville_residual", "spectral_radius", "spectral_radius_error"),
+                _liouville,
+            ),
+            within("spectral_radius", 0.0),
+        ),
+        gaps=("floquet_multiplier", "floquet_multiplier_error", "floquet_exponent"),
+    ),
+    "forced": Declared(
+        (within("amplitude", 0.0), within("condition", 1.0), within("orbit_amplitude", 0.0)), kept=("condition",)
+    ),
+    "steady_state": Declared(
+        (
+            *MOTION,
+            in_order("u_min", "u_mean", "u_max"),
+            within("impacts", 0.0),
+            within("contact_fraction", 0.0, 1.0),
+        ),
+        # NaN is allowed: a motion that never repeats has no multipliers, a motion at rest has no phase, and a spectral
+        # radius that underflows has no exponent.
+        gaps=("phase", "spectral_radius", "floquet_multiplier", "lyapunov_exponent", "state_error"),
+    ),
+    "frequency_response": Declared(
+        (
+            *MOTION,
+            in_order("branch_u_min", "branch_u_max"),
+            within("branch_amplitude", 0.0),
+            within("branch_spectral_radius", 0.0),
+            relation("largest branch_amplitude rises along branch", ("branch_amplitude", "outcome"), _branches_fall),
+            relation(
+                "branch_stability follows from branch_spectral_radius",
+                ("branch_stability", "branch_spectral_radius"),
+                _stability_differs,
+            ),
+            ordered("fold_frequency", "fold"),
+            ordered("doubling_frequency", "doubling"),
+        ),
+        # NaN is allowed: the dimensions of branches and folds are longer than most points need, a motion at rest has no
+        # phase, and some frequencies have no backbone.
+        gaps=(
+            "phase",
+            "branch_u_max",
+            "branch_u_min",
+            "branch_amplitude",
+            "branch_spectral_radius",
+            "fold_frequency",
+            "doubling_frequency",
+            "backbone_amplitude",
+            "peak_amplitude",
+            "peak_frequency",
+            "spectral_radius",
+            "state_error",
+        ),
+        kept=("fit_range",),
+    ),
+    "basins": Declared(
+        (
+            within("basin_fraction", 0.0, 1.0),
+            sums_to_one("basin_fraction", "attractor", ("unsettled_fraction",)),
+            in_order("attractor_u_min", "attractor_u_max"),
+        ),
+        # NaN is allowed: results hold up to eight attractors, and most points have fewer.
+        gaps=("basin_fraction", "basin_error", "attractor_u_max", "attractor_u_min"),
+        kept=("unsettled_fraction",),
+    ),
+    "lyapunov": Declared(
+        (
+            ordered("lyapunov_spectrum", "exponent", falling=True),
+            relation("the exponents sum to the mean divergence", ("sum_rule_residual", "lyapunov_spectrum"), _sum_rule),
+            within("chaos_k01", -1.0, 1.0),
+            within("period_multiple", 0.0),
+        ),
+        # NaN is allowed: an unbounded motion has only exponents, and the history of a run ends where it converged.
+        gaps=(
+            "lyapunov_standard_error",
+            "lyapunov_history",
+            "sum_rule_residual",
+            "paper_estimator",
+            "chaos_k01",
+        ),
+    ),
+    "poincare": Declared(
+        (within("distinct_points", 0.0), within("chaos_k01", -1.0, 1.0)),
+        # K is undefined for a short section that does not repeat.
+        gaps=("chaos_k01",),
+    ),
+    "modes": Declared(
+        (
+            ordered("natural_frequency", "mode"),
+            within("natural_frequency", 0.0),
+            within("participation", 0.0, 1.0),
+            sums_to_one("participation", "family"),
+            within("dominant_share", 0.0, 1.0),
+            within("kinetic_energy", 0.0, 1.0),
+            sums_to_one("kinetic_energy", "body"),
+            within("mac", 0.0, 1.0),
+        )
+    ),
+    "critical_speeds": Declared(
+        (
+            ordered("natural_frequency", "mode"),
+            within("natural_frequency", 0.0),
+            multiple("angular_frequency", 2 * math.pi, "natural_frequency"),
+            multiple("critical_speed", 60.0, "natural_frequency"),
+            within("count_certified", 0.0, 1.0),
+            within("mode_shape", -1.0, 1.0),
+        )
+    ),
 }

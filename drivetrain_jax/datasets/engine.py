@@ -1,4 +1,4 @@
-"""The engine ``drivetrain`` of xarray: opens an atlas as a lazy Dataset.
+"""The engine ``drivetrain`` of xarray: opens an atlas as a lazy Dataset whose cells are evaluated when they are accessed.
 
 xarray imports this module whenever it looks for an engine. Modules that compute are therefore imported later, when an atlas
 is opened.
@@ -8,21 +8,35 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from xarray.backends import BackendEntrypoint
+import numpy as np
+import xarray as xr
+from xarray.backends import BackendArray, BackendEntrypoint
+from xarray.core import indexing, nputils
 
+from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import Parameter
 from drivetrain_jax._wording import shown
 from drivetrain_jax.store.files import ATLAS_PREFACE
 
 if TYPE_CHECKING:
-    import xarray as xr
+    from drivetrain_jax.runs.atlas_file import StoredAtlas
 
 _GAPS = ("solve", "nan")
+# Number of values of a parameter that the grid does not name.
+_DEFAULT = 512
+_ALLOWED = "a number of values (1000), (START, STOP, NUM), a row of values, or one value (0.5)"
 # Most cells of a chunk of automatic size, and most cells along one axis.
 _CHUNK, _LONGEST = 1 << 18, 1 << 10
+# Bytes of the other results of a selection that are kept, and number of selections: the variables of a selection are usually
+# requested one after another, each of them once.
+_BYTES, _SELECTIONS = 6_000_000, 4
+
+Key = tuple[int | slice | np.ndarray, ...]
 
 
 class AtlasEntrypoint(BackendEntrypoint):
@@ -72,23 +86,19 @@ class AtlasEntrypoint(BackendEntrypoint):
             raise InputError(f"gaps = {shown(gaps)}: allowed is one of {', '.join(_GAPS)}")
         path = os.path.abspath(os.path.expanduser(os.fspath(filename_or_obj)))
         dropped = {drop_variables} if isinstance(drop_variables, str) else set(drop_variables or ())
-        return _opened(path, grid, gaps == "solve").drop_vars(dropped, errors="ignore")
+        return _on_grid(path, grid, gaps == "solve").drop_vars(dropped, errors="ignore")
 
 
-def _opened(path: str, grid: Any, solve: bool) -> xr.Dataset:
-    import numpy as np
-    import xarray as xr
-    from xarray.core import indexing
-
+def _on_grid(path: str, grid: Any, solve: bool) -> xr.Dataset:
     from drivetrain_jax.analysis import OUTCOME
-    from drivetrain_jax.datasets.lazy import GAP, AtlasArray, AtlasGrid, grid_values, in_atlas_parameters, whole
     from drivetrain_jax.runs.assemble import to_dataset
     from drivetrain_jax.runs.atlas_chart import in_physical_units
 
-    grid, views = in_atlas_parameters(whole(path), grid)
-    axes, fixed = grid_values(whole(path), grid)
-    cells = AtlasGrid(path, axes, fixed, solve)
-    atlas = cells.atlas
+    whole = _opened(path, _stamp(path))
+    grid, views = _in_atlas_parameters(whole, grid)
+    axes, fixed = _grid_values(whole, grid)
+    cells = _Cells(path, axes, fixed, solve)
+    atlas = cells.atlas({})
     point = atlas.stability.blank((), atlas.request.outputs)
     shape = tuple(len(values) for values in axes.values())
     # Broadcast numbers take no memory.
@@ -98,17 +108,24 @@ def _opened(path: str, grid: Any, solve: bool) -> xr.Dataset:
     chunks = _chunks(axes, dict(zip(atlas.parameters, degrees.tolist(), strict=True)))
     for name, value in point.items():
         variable = dataset[name].variable
-        data = indexing.LazilyIndexedArray(AtlasArray(cells, name, value.shape, value.dtype))
+        data = indexing.LazilyIndexedArray(_Result(cells, name, variable.shape, value.dtype))
         sizes = dict(zip(variable.dims, variable.shape, strict=True))
         dataset[name] = xr.Variable(variable.dims, data, variable.attrs, {"preferred_chunks": sizes | chunks})
     if not solve:
         about = dataset[OUTCOME.name].attrs
-        about["flag_values"] = np.arange(GAP + 1, dtype=OUTCOME.dtype)
+        about["flag_values"] = np.arange(gap() + 1, dtype=OUTCOME.dtype)
         about["flag_meanings"] += " gap"
     dataset = dataset.assign_coords({name: ((), value, atlas.labels(name)) for name, value in fixed.items()})
     for name, (quantity, convert) in views.items():
         dataset = in_physical_units(dataset, name, quantity, convert)
     return dataset
+
+
+def gap() -> int:
+    """The outcome of a cell in a gap of the atlas that is not solved. No file contains this code."""
+    from drivetrain_jax.analysis import Outcome
+
+    return len(Outcome)
 
 
 def _chunks(axes: dict[str, Any], degrees: dict[str, int]) -> dict[str, int]:
@@ -125,3 +142,183 @@ def _chunks(axes: dict[str, Any], degrees: dict[str, int]) -> dict[str, int]:
         chunks[name] = -(-length // -(-length // max(1, min(length, most, _LONGEST))))
         left //= chunks[name]
     return {name: chunks[name] for name in axes}
+
+
+def _in_atlas_parameters(atlas: StoredAtlas, grid: Any) -> tuple[Any, dict[str, tuple[Parameter, Any]]]:
+    """``grid`` with parameters of the atlas for physical data and texts, and the quantities that replace parameters.
+
+    A quantity comes with the function that gives its values. Raises :class:`InputError` for physical data that do not
+    determine a parameter.
+    """
+    from drivetrain_jax.runs.physical import in_parameters
+
+    names = atlas.scene.system.physical.names if atlas.scene.system.physical else ()
+    if not isinstance(grid, Mapping) or not any(name in names or _is_written(value) for name, value in grid.items()):
+        return grid, {}
+    counts = {name: value for name, value in grid.items() if _is_count(value)}
+    rows = {name: value[:2] if _is_range(value) else value for name, value in grid.items() if name not in counts}
+    given, _ = in_parameters(atlas.scene.system, rows, atlas.scene.data)
+    found = atlas.in_parameters(rows)
+    for name, value in grid.items():
+        parameter = given.parameter_of(name) if given else name
+        if name in counts:
+            found[parameter] = value
+        elif parameter in found and _is_range(value):
+            found[parameter] = (*found[parameter], value[2])
+    backs = {name: given.back(name) for name in found if given and name not in grid}
+    return found, {name: back for name, back in backs.items() if back and back[0].name in grid}
+
+
+def _is_written(given: Any) -> bool:
+    ends = given if isinstance(given, (tuple, list)) else (given,)
+    return any(isinstance(end, str) and _units.split(end) for end in ends)
+
+
+def _is_count(given: Any) -> bool:
+    return isinstance(given, (int, np.integer)) and not isinstance(given, bool)
+
+
+def _is_range(given: Any) -> bool:
+    return isinstance(given, tuple) and len(given) == 3 and _is_count(given[2])
+
+
+def _grid_values(atlas: StoredAtlas, grid: Any) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """Axes ``(N,)`` in the order of the atlas's parameters, and the values of the parameters that do not vary.
+
+    ``grid`` is that of :meth:`AtlasEntrypoint.open_dataset` with names of parameters; any other raises :class:`InputError`.
+    """
+    given = dict.fromkeys(atlas.parameters, grid) if _is_count(grid) else {} if grid is None else grid
+    if not isinstance(given, Mapping):
+        raise InputError(f"grid = {shown(grid)}: allowed is a number of values, or a table by the names of parameters")
+    for name, value in given.items():
+        if name not in atlas.parameters:
+            atlas.refuse(str(name), value)
+    values = {name: _values(atlas, name, given.get(name, _DEFAULT)) for name in atlas.parameters}
+    axes = {name: value for name, value in values.items() if value.ndim}
+    if not axes:
+        raise InputError("grid: fixes all parameters; allowed is one that varies, and query answers for a point")
+    return axes, {name: float(value) for name, value in values.items() if not value.ndim}
+
+
+def _values(atlas: StoredAtlas, name: str, given: Any) -> np.ndarray:
+    """The values of a parameter that varies, or the one that it has."""
+    start, stop, count = (*atlas.ranges[name], given) if _is_count(given) else given if _is_range(given) else (0, 0, 0)
+    if count < 2 and (_is_count(given) or _is_range(given)):
+        allowed = f"allowed is 2 or more; {float(count)} would fix {name}"
+        raise InputError(f"grid.{name} = {count}: is a number of values; {allowed}")
+    try:
+        values = np.linspace(float(start), float(stop), count) if count else np.asarray(given)
+    # Words, and rows of different lengths.
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    if values.dtype.kind not in "iuf" or values.ndim > 1 or not values.size:
+        raise InputError(f"grid.{name} = {shown(given)}: allowed is {_ALLOWED}")
+    atlas.check_within(name, values)
+    return values.astype(float)
+
+
+class _Cells:
+    """Results of an atlas file on the outer product of ``axes``; the other parameters are ``fixed``.
+
+    A pickle contains only the path and the grid, so another process opens the file itself.
+    """
+
+    def __init__(self, path: str, axes: Mapping[str, np.ndarray], fixed: Mapping[str, float], solve: bool) -> None:
+        self.path, self.axes, self.fixed, self.solve = path, dict(axes), dict(fixed), solve
+        self._stamp = _stamp(path)
+        self._kept: dict[tuple, dict[str, np.ndarray]] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_kept": {}}
+
+    def atlas(self, values: Mapping[str, float]) -> StoredAtlas:
+        """The atlas of the parameters that vary, with ``values`` for some of them."""
+        if _stamp(self.path) != self._stamp:
+            raise InputError(f"file = {self.path!r}: has changed since it was opened; allowed is to open it again")
+        return _sliced(self.path, self._stamp, tuple({**self.fixed, **values}.items()))
+
+    def block(self, key: Key, name: str) -> np.ndarray:
+        """The result ``name`` where ``key`` has a position, a slice or a row of positions for each axis."""
+        columns = {axis: values[part] for (axis, values), part in zip(self.axes.items(), key, strict=True)}
+        varied = {axis: column for axis, column in columns.items() if column.ndim}
+        numbers = {axis: float(column) for axis, column in columns.items() if not column.ndim}
+        if not varied:
+            return self.points(key, name)
+        return self._cached(columns, name, lambda: self.atlas(numbers).arrays(varied, solve=self.solve))
+
+    def points(self, positions: Sequence[Any], name: str) -> np.ndarray:
+        """The result ``name`` at points, given by their positions along each axis, numbers or arrays of equal shape."""
+        columns = {axis: values[part] for (axis, values), part in zip(self.axes.items(), positions, strict=True)}
+        shape = next(iter(columns.values())).shape
+        rows = {axis: column.reshape(-1) for axis, column in columns.items()}
+        values = self._cached(columns, name, lambda: self.atlas({}).arrays(rows, zipped=True, solve=self.solve))
+        return values.reshape(shape + values.shape[1:])
+
+    def _cached(
+        self, columns: Mapping[str, np.ndarray], name: str, evaluate: Callable[[], Mapping[str, np.ndarray]]
+    ) -> np.ndarray:
+        """One result of a selection; the other results of the newest selections are kept until they are requested."""
+        key = tuple((column.shape, column.tobytes()) for column in columns.values())
+        if (values := self._kept.get(key, {}).pop(name, None)) is None:
+            results = {other: np.asarray(values) for other, values in evaluate().items()}
+            if not self.solve:
+                from drivetrain_jax.analysis import OUTCOME, Outcome
+
+                outcome = results[OUTCOME.name]
+                results[OUTCOME.name] = np.where(outcome == Outcome.LOST, np.int8(gap()), outcome)
+            values = results.pop(name)
+            if sum(others.nbytes for others in results.values()) <= _BYTES:
+                self._kept = dict([*self._kept.items(), (key, results)][-_SELECTIONS:])
+        return values
+
+
+class _Result(BackendArray):
+    """One result on the grid of ``cells``."""
+
+    def __init__(self, cells: _Cells, name: str, shape: tuple[int, ...], dtype: np.dtype) -> None:
+        self.cells, self.name, self.shape, self.dtype = cells, name, shape, np.dtype(dtype)
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> np.ndarray:
+        support = indexing.IndexingSupport
+        if isinstance(key, indexing.VectorizedIndexer):
+            return indexing.explicit_indexing_adapter(key, self.shape, support.VECTORIZED, self._points)
+        return indexing.explicit_indexing_adapter(key, self.shape, support.OUTER, self._block)
+
+    def _points(self, key: Key) -> np.ndarray:
+        indices = np.ogrid[tuple(slice(size) for size in self.shape)]
+        every = [nputils.NumpyVIndexAdapter(np.broadcast_to(index, self.shape))[key] for index in indices]
+        swept, own = every[: len(self.cells.axes)], every[len(self.cells.axes) :]
+        if not own:
+            return self.cells.points(swept, self.name)
+        # The dimension of a slice comes last, those of arrays are shared by all axes.
+        sliced = isinstance(key[-1], slice)
+        values = self.cells.points([part[..., 0] for part in swept] if sliced else swept, self.name)
+        return values[..., key[-1]] if sliced else np.take_along_axis(values, own[0][..., None], -1)[..., 0]
+
+    def _block(self, key: Key) -> np.ndarray:
+        sizes = [np.arange(n)[k].size for k, n in zip(key, self.shape, strict=True) if not _is_count(k)]
+        if not all(sizes):
+            return np.empty(sizes, self.dtype)
+        count = len(self.cells.axes)
+        return self.cells.block(key[:count], self.name)[(..., *key[count:])]
+
+
+def _stamp(path: str) -> tuple[int, int]:
+    try:
+        about = os.stat(path)
+    except OSError as error:
+        raise InputError(f"file = {path!r}: {error.strerror}; give the file of an atlas") from None
+    return about.st_mtime_ns, about.st_size
+
+
+@lru_cache(maxsize=4)
+def _opened(path: str, stamp: tuple[int, int]) -> StoredAtlas:
+    """The atlas in the file at ``path``; a file that has not changed is read once."""
+    from drivetrain_jax.runs.atlas_file import open_atlas
+
+    return open_atlas(path)
+
+
+@lru_cache(maxsize=8)
+def _sliced(path: str, stamp: tuple[int, int], values: tuple[tuple[str, float], ...]) -> StoredAtlas:
+    return _opened(path, stamp).slice(dict(values))

@@ -10,20 +10,24 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import xarray as xr
+
 from drivetrain_jax import view
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import shown
-from drivetrain_jax.datasets.resonances import LABELS, resonances
-from drivetrain_jax.view.units import check_measured, in_given_units, in_units, listed, size
+from drivetrain_jax.resonances import BUILT_IN, Resonances
+from drivetrain_jax.view.style import is_joined, parameters, scene_key
+from drivetrain_jax.view.units import check_measured, in_units, listed, size
 
 if TYPE_CHECKING:
-    import xarray as xr
     from matplotlib.figure import Figure
 
     Result = xr.Dataset | str | Path
 
 # Analyses whose figures show predicted resonances.
 _PREDICTED = ("floquet", "forced", "frequency_response", "steady_state")
+LABELS = "resonance"
 # Default number of cells along each axis in the chart of an atlas.
 CELLS = 800
 # Most cells of a figure: matplotlib needs some hundred bytes for each.
@@ -100,7 +104,7 @@ def table(path: Path, units: str | None, separator: str = "") -> str:
     from drivetrain_jax.view.sheet import shown_title
     from drivetrain_jax.view.style import caption
 
-    dataset = charts.prepare(in_units(in_given_units(dataset), [] if units is None else listed(units)))
+    dataset = charts.prepare(in_units(dataset, [] if units is None else listed(units)))
     if charts.sweep_axes(dataset) or not charts.results(dataset):
         raise charts.wrong_axes(dataset, "none for a table; a figure ends in .png, .pdf, .svg")
     rows = charts.table_rows(dataset, ".17g" if separator else ".6g")
@@ -118,15 +122,13 @@ def drawn(datasets: list[xr.Dataset], asked: list[str], check: bool = True) -> F
 
     ``check`` raises :class:`InputError` for a unit that measures nothing in the first dataset.
     """
-    datasets = [_with_resonances(in_physical_data(each, asked) if asked else each) for each in datasets]
+    datasets = [_with_resonances(in_physical_data(each, asked)) for each in datasets]
     if check:
         check_measured(datasets[0], asked)
-    return view.plot(*(in_units(in_given_units(each), asked) for each in datasets))
+    return view.plot(*(in_units(each, asked) for each in datasets))
 
 
 def _dataset(source: Any) -> xr.Dataset:
-    import xarray as xr
-
     if isinstance(source, xr.Dataset):
         return source
     if isinstance(source, (str, Path)):
@@ -177,7 +179,7 @@ def in_physical_data(dataset: xr.Dataset, asked: Sequence[str]) -> xr.Dataset:
     axes = [dim for dim in dataset["outcome"].dims if dim in dataset.coords] if "outcome" in dataset else []
     pure = [str(dim) for dim in axes if dataset[dim].attrs.get("units") == "1"]
     data = {n: e["value"] for n, e in json.loads(dataset.attrs.get("physical_data", "{}")).items()}
-    if not (pure and data):
+    if not (asked and pure and data):
         return dataset
     # Local import: the modules import jax, which figures in the units of the file do not need.
     from drivetrain_jax.runs.atlas_chart import in_physical_units
@@ -221,3 +223,72 @@ def _loaded(dataset: xr.Dataset) -> xr.Dataset:
             f"result: has {outcome.size:.3g} cells; allowed in a figure are up to {_MOST_CELLS:.0e}: {some}"
         )
     return dataset.compute().assign_coords({d: range(n) for d, n in outcome.sizes.items() if d not in dataset.coords})
+
+
+def resonances(dataset: xr.Dataset) -> xr.DataArray | None:
+    """The predicted resonances of the system of ``dataset``, values of one of its axes; None without any.
+
+    Returns: ``resonance_AXIS``; its dimensions are the axes that the predictions depend on, then ``resonance`` (labels).
+    """
+    predicted = _predicted(str(dataset.attrs.get("system")))
+    if predicted is None or is_joined(dataset):
+        return None
+    # Axes given in physical data: the predictions are those along their parameters.
+    given = {name: str(c.dims[0]) for name, c in dataset.coords.items() if c.ndim == 1 and c.dims[0] != name}
+    used = (predicted.axis, *predicted.parameters)
+    given = {str(n): dim for n, dim in given.items() if n in used and dim in dataset and dim != "point"}
+    found = _along_parameters(dataset.swap_dims({dim: name for name, dim in given.items()}), predicted)
+    return None if found is None else _along_given(found, dataset, given, predicted.axis)
+
+
+def _along_given(found: xr.DataArray, dataset: xr.Dataset, given: dict[str, str], axis: str) -> xr.DataArray:
+    """``found`` along the axes of the dataset, as values of the quantity that is given in place of ``axis``."""
+    swapped = {name: dim for name, dim in given.items() if name in found.dims}
+    own = {dim: (name, dataset[dim].values, dataset[dim].attrs) for name, dim in swapped.items()}
+    found = found.assign_coords(own).swap_dims(swapped)
+    found = found.drop_vars(list(swapped))
+    if axis not in given:
+        return found
+    quantity = dataset[given[axis]]
+    order = np.argsort(dataset[axis].values)
+    known = dataset[axis].values[order], quantity.values[order]
+    # Quantity and parameter are proportional, or else known within the axis alone.
+    ratio = known[1][-1] / known[0][-1]
+    if np.allclose(known[1], ratio * known[0], rtol=1e-12, atol=0):
+        values = found.values * ratio
+    else:
+        values = np.interp(found.values, *known, left=np.nan, right=np.nan)
+    attrs = found.attrs | {"units": quantity.attrs["units"]}
+    return xr.DataArray(values, found.coords, found.dims, f"{LABELS}_{given[axis]}", attrs)
+
+
+def _along_parameters(dataset: xr.Dataset, predicted: Resonances) -> xr.DataArray | None:
+    varied = {scene_key(coordinate).partition("[")[0] for coordinate in dataset.coords.values() if coordinate.ndim}
+    known = {name: value for name, value in parameters(dataset).items() if name not in varied}
+    known |= {str(dim): dataset[dim].values for dim in dataset.dims if dim in dataset.coords}
+    needed, without = set(predicted.parameters), set(predicted.without)
+    if predicted.axis not in dataset.dims or not needed <= known.keys() or without & {*known, *dataset.coords}:
+        return None
+    dims = [str(dim) for dim in dataset.dims if dim in needed]
+    mesh = dict(zip(dims, np.meshgrid(*(known[dim] for dim in dims), indexing="ij"), strict=True))
+    about = {"units": dataset[predicted.axis].attrs["units"], "long_name": predicted.long_name}
+    return xr.DataArray(
+        predicted.values(known | mesh),
+        {dim: dataset[dim] for dim in dims} | {LABELS: (LABELS, list(predicted.labels), {"long_name": "resonance"})},
+        [*dims, LABELS],
+        f"{LABELS}_{predicted.axis}",
+        about,
+    )
+
+
+def _predicted(system: str) -> Resonances | None:
+    if system in BUILT_IN:
+        return BUILT_IN[system]
+    # Local import: the module imports jax.
+    from drivetrain_jax.runs.scene import find_system
+
+    try:
+        return find_system(system).resonances
+    except InputError:
+        # The package of the system is not installed, or the dataset is a sweep of a function.
+        return None

@@ -18,8 +18,11 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-# Analyses with a figure of their own, analysis/NAME/figure.py.
-_DRAWN = tuple(sorted(path.parent.name for path in Path(__file__).parents[1].glob("analysis/*/figure.py")))
+# Analyses of this package, but for the atlas, which is drawn as a chart, and those with a figure of their own.
+_ANALYSES, _DRAWN = (
+    tuple(sorted({path.parent.name for path in Path(__file__).parents[1].glob(f"analysis/*/{file}.py")} - {"atlas"}))
+    for file in ("analysis", "figure")
+)
 # Analyses whose results may share a figure.
 _OVERLAYS = ("frequency_response",)
 
@@ -38,7 +41,7 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     if analysis == "atlas":
         drawn = "what its `grid` and `drivetrain plot` make of it"
         raise InputError(f"analysis = 'atlas': is a function; allowed is {drawn}")
-    plugin = None if analysis in _DRAWN else _plugin(analysis)
+    plugin = None if analysis in _ANALYSES else _plugin(analysis)
     if others and plugin is None and analysis not in _OVERLAYS:
         raise InputError(f"analysis = {analysis!r}: several results in one figure; allowed for {', '.join(_OVERLAYS)}")
     for other in others:
@@ -53,16 +56,16 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     if plugin is not None:
         allowed = "a matplotlib Figure"
         return call_plugin(FIGURES, analysis, "figure", plugin, dataset, *others, kind=Figure, allowed=allowed)
-    if analysis not in _DRAWN and "outcome" not in dataset:
-        known = ", ".join((*_DRAWN, *plugin_names(FIGURES)))
+    if analysis not in _ANALYSES and "outcome" not in dataset:
+        known = ", ".join((*_ANALYSES, *plugin_names(FIGURES)))
         raise InputError(f"analysis = {analysis!r}: has no figure; allowed is one of {known}")
 
-    from drivetrain_jax.view.charts import chart, prepare
+    from drivetrain_jax.view.charts import LOOKS, chart, prepare
     from drivetrain_jax.view.style import STYLE
 
     with rc_context(STYLE):
         if analysis not in _DRAWN:
-            return chart(prepare(dataset))
+            return chart(prepare(dataset), **LOOKS.get(analysis, {}))
         module = import_module(f"drivetrain_jax.analysis.{analysis}.figure")
         return module.plot(*map(prepare, (dataset, *others)))
 

@@ -18,12 +18,14 @@ from matplotlib.colors import LinearSegmentedColormap, ListedColormap, LogNorm, 
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
+from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range
 from drivetrain_jax.view import overlays
-from drivetrain_jax.view.sheet import Sheet, cell_edges, fit_axis, is_logarithmic, plain_decades, widen
+from drivetrain_jax.view.sheet import Sheet, cell_edges, fit_axis, is_logarithmic, plain_decades, widen, write_names
 from drivetrain_jax.view.style import (
     FAILED_COLOUR,
     FLAG_COLOURS,
@@ -63,6 +65,16 @@ _WIDE = 3.0
 _DASHES, _FEW = ("-", (0, (4, 1.5)), ":"), 12
 # Variables with a band of error: the stored error and its factor.
 _BANDS = {"lyapunov_spectrum": ("lyapunov_standard_error", 3.0), "basin_fraction": ("basin_error", 1.0)}
+_AMPLITUDES = ("amplitude", "orbit_amplitude")
+# Panels of lines, fields of maps, and options of lines, by analysis; those of others are all results.
+LOOKS: dict[str, dict[str, Any]] = {
+    "floquet": {"panels": [["spectral_radius"]], "fields": ["verdict", "spectral_radius"]},
+    "forced": {
+        "panels": [_AMPLITUDES, ["orbit_spectral_radius"], ["condition"]],
+        "logarithmic": (*_AMPLITUDES, "condition"),
+    },
+    "parameters": {"colours": LINE_COLOURS[:1]},
+}
 # Position between largest decay (-1), none (0) and largest growth (1), and colour; lightness falls monotonically. White is
 # reserved for cells without a value.
 _GROWTH_COLOURS = (
@@ -73,6 +85,10 @@ _GROWTH_COLOURS = (
     (0.5, "#b8432f"),
     (1.0, "#2d0a2b"),
 )
+# Interference diagrams: line styles of the orders; range of the axes relative to the outermost crossings, and to the highest
+# operating speed; most modes of which all orders have numbers, which stand below the line of the mode.
+_ORDER_DASHES, _SPACE, _BEYOND, _FEW_MODES = ("solid", "dashed", "dotted", "dashdot"), 1.12, 1.4, 8
+_NUMBER: dict[str, Any] = {"va": "top", "path_effects": [withStroke(linewidth=2, foreground="white")]}
 # Distance of a spectral radius from 1 that rounding can make.
 _ROUNDING = 1e-12
 
@@ -112,28 +128,22 @@ def wrong_axes(dataset: xr.Dataset, allowed: str) -> InputError:
     return InputError(f"axes = {axes}: allowed is {allowed}")
 
 
-def require(dataset: xr.Dataset, *names: str) -> None:
-    """Raise :class:`InputError` unless all of these variables are stored."""
-    if missing := [name for name in names if name not in dataset]:
-        stored = ", ".join(str(name) for name in dataset.data_vars)
-        raise InputError(f"outputs = {stored}: {' and '.join(missing)} missing; the figure needs {' and '.join(names)}")
-
-
-def require_any(dataset: xr.Dataset, *names: str) -> list[str]:
-    """The stored variables among ``names``; raises :class:`InputError` if none is stored."""
+def require(dataset: xr.Dataset, *names: str, some: bool = False) -> list[str]:
+    """The stored variables among ``names``; raises :class:`InputError` unless all are stored, or ``some``."""
     stored = [name for name in names if name in dataset]
-    if not stored:
-        listed = ", ".join(str(name) for name in dataset.data_vars)
-        raise InputError(f"outputs = {listed}: nothing to plot; the figure needs {' or '.join(names)}")
+    if not stored or (len(stored) < len(names) and not some):
+        outputs = ", ".join(str(name) for name in dataset.data_vars)
+        missing = " and ".join(name for name in names if name not in dataset)
+        lack, needed = ("nothing to plot", " or ") if some else (f"{missing} missing", " and ")
+        raise InputError(f"outputs = {outputs}: {lack}; the figure needs {needed.join(names)}")
     return stored
 
 
 def require_values(variable: xr.DataArray, positive: bool = False) -> None:
     """Raise :class:`InputError` unless ``variable`` has a finite value (above zero if ``positive``)."""
     finite = variable.values[np.isfinite(variable.values)]
-    largest = finite.max() if finite.size else np.nan
-    if not (largest > 0 if positive else finite.size):
-        kind = "positive" if positive else "finite"
+    if not (finite.size and (finite.max() > 0 or not positive)):
+        kind, largest = "positive" if positive else "finite", finite.max() if finite.size else np.nan
         raise InputError(f"{variable.name} = {largest:g}: nothing to plot; allowed is a result with a {kind} value")
 
 
@@ -269,64 +279,62 @@ def _is_radius(name: object) -> bool:
     return str(name).endswith("spectral_radius")
 
 
-def _draw_growth(axes: Axes, part: xr.Dataset, field: xr.DataArray, names: Sequence[str]) -> tuple[QuadMesh, str, dict]:
-    """Draw the growth that the spectral radius ``field`` means; returns label and options of the colour bar."""
-    growth = growth_of(part)
-    low, high, values = -growth.largest, growth.largest, growth.of(field)
+def colours(field: xr.DataArray, growth: Growth | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Options of the cells and of the colour bar for the values of ``field``: the colours of flags; those of ``growth``,
+    which change at the limit of stability; or darker ones for larger values, logarithmic if positive values (and zeros)
+    differ widely."""
+    if _flags(field):
+        return flag_scale(field), {}
+    values = field.values[np.isfinite(field.values) | (growth is not None)]
+    if growth is None:
+        positive = values[values > 0]
+        low, high = (values.min(), values.max()) if values.size else (0.0, 1.0)
+        logarithmic = low >= 0 and positive.size > 0 and high > _WIDE * positive.min()
+        norm = LogNorm(positive.min(), high) if logarithmic else Normalize(low, high)
+        return {"cmap": matplotlib.colormaps["cividis_r"].with_extremes(bad=FAILED_COLOUR), "norm": norm}, {}
+    high = growth.largest
     cmap = LinearSegmentedColormap.from_list("growth", [((1 + x) / 2, colour) for x, colour in _GROWTH_COLOURS], N=1024)
-    norm = SymLogNorm(growth.linear, linscale=0.5, vmin=low, vmax=high, base=10)
-    below, above = bool((values < low).any()), bool((values > high).any())
-    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
-    # A radius of 0 is the fastest decay, not a missing value.
-    cmap = cmap.with_extremes(bad=FAILED_COLOUR)
-    mesh = draw_cells(axes, values.clip(low, high), names[0], names[1], cmap=cmap, norm=norm)
+    norm = SymLogNorm(growth.linear, linscale=0.5, vmin=-high, vmax=high, base=10)
+    beyond = (bool((values < -high).any()), bool((values > high).any()))
+    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
     decades = 10.0 ** np.arange(np.log10(growth.linear) + 1, np.log10(high) + 0.5)
-    return mesh, growth.label, {"extend": extend, "ticks": [*-decades[::-1], 0.0, *decades]}
-
-
-def shades(values: np.ndarray) -> dict[str, Any]:
-    """Colours of ``values``, darker for larger; logarithmic for positive values (and zeros) that differ widely."""
-    finite = values[np.isfinite(values)]
-    positive = finite[finite > 0]
-    low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
-    logarithmic = low >= 0 and positive.size > 0 and high > _WIDE * positive.min()
-    norm = LogNorm(positive.min(), high) if logarithmic else Normalize(low, high)
-    return {"cmap": matplotlib.colormaps["cividis_r"].with_extremes(bad=FAILED_COLOUR), "norm": norm}
+    bar = {"extend": extend, "ticks": [*-decades[::-1], 0.0, *decades]}
+    return {"cmap": cmap.with_extremes(bad=FAILED_COLOUR), "norm": norm}, bar
 
 
 def chart(
     dataset: xr.Dataset,
     panels: Sequence[Sequence[str]] = (),
     fields: Sequence[str] = (),
-    *,
-    forced: bool = False,
     **look: Any,
 ) -> Figure:
-    """The figure of any result: a table or lines of a single point, lines over one axis, maps over two, small multiples over
-    more.
+    """The figure of any result: multipliers, a table or lines of a single point, lines over one axis, maps over two, small
+    multiples over more.
 
-    ``panels`` lists the variables of each panel of lines, ``fields`` those of maps; default: all results. ``forced`` draws
-    only those predicted resonances that the forcing excites. ``look`` goes to :func:`draw_lines`.
+    ``panels`` lists the variables of each panel of lines, ``fields`` those of maps; default: all results. ``look`` goes to
+    :func:`draw_lines`.
     """
     names, every = sweep_axes(dataset), [[name] for name in results(dataset)]
+    if not names and "floquet_multiplier" in dataset:
+        return _plane(dataset)
     wanted = panels if len(names) < 2 else [[name] for name in fields or [key for panel in panels for key in panel]]
     stored = [keys for panel in wanted or every if (keys := [key for key in panel if key in dataset])]
     if not stored:
-        require_any(dataset, *(key for panel in wanted or [["a result"]] for key in panel))
+        require(dataset, *(key for panel in wanted or [["a result"]] for key in panel), some=True)
     if names == ["point"]:
         if len(varying_parameters(dataset)) > 1 and _flagged(dataset):
             return _scatter(dataset)
         dataset, look = along_points(dataset), {"marker": "o", "markersize": 3} | look
         names = sweep_axes(dataset)
     if len(names) > 1:
-        return _small_multiples(dataset, [key for keys in stored for key in keys], forced)
+        return _small_multiples(dataset, [key for keys in stored for key in keys])
     long = [str(d) for (key, *_) in stored for d in dataset[key].dims if dataset.sizes[d] > _MOST_ENTRIES]
     if not names and not long:
         return _table(dataset)
     along = (names or long)[0]
     shown = [keys for keys in stored if all(along in dataset[key].dims for key in keys)][:_MOST_PANELS]
     left_out = f"{len(shown)} of {len(stored)} results shown" if len(shown) < len(stored) else ""
-    return stack(dataset, along, shown, forced=forced, **look).finish(dataset, left_out)
+    return stack(dataset, along, shown, **look).finish(dataset, left_out)
 
 
 def results(dataset: xr.Dataset) -> list[str]:
@@ -341,6 +349,20 @@ def results(dataset: xr.Dataset) -> list[str]:
 def _flagged(dataset: xr.Dataset) -> str:
     """The variable whose flags say what happens at a point, or an empty string."""
     return next((name for name in ("verdict", "regime") if name in dataset), "")
+
+
+def _plane(dataset: xr.Dataset) -> Figure:
+    """Floquet multipliers and the unit circle."""
+    multipliers = dataset["floquet_multiplier"]
+    require_values(multipliers)
+    sheet, angle = Sheet(height=4.0), np.linspace(0, 2 * np.pi, 361)
+    axes, values = sheet.axes[0, 0], multipliers.values
+    circle = axes.plot(np.cos(angle), np.sin(angle), color=FRAME_GREY, linewidth=0.8, label="unit circle")
+    style = {"color": LINE_COLOURS[0], "markersize": 5, "label": "Floquet multipliers"}
+    sheet.add(*axes.plot(np.real(values), np.imag(values), "o", **style), *circle)
+    axes.set_aspect("equal", adjustable="datalim")
+    sheet.label("real part of the multiplier", "imaginary part")
+    return sheet.finish(dataset)
 
 
 def _table(dataset: xr.Dataset) -> Figure:
@@ -389,7 +411,7 @@ def _scatter(dataset: xr.Dataset) -> Figure:
     return sheet.finish(dataset)
 
 
-def _small_multiples(dataset: xr.Dataset, fields: Sequence[str], forced: bool) -> Figure:
+def _small_multiples(dataset: xr.Dataset, fields: Sequence[str]) -> Figure:
     """Maps over the speed and the longest other axis; columns and rows for the values of further axes.
 
     Of an axis with many values the first, middle and last are shown; with two further axes only the first of ``fields``
@@ -414,7 +436,7 @@ def _small_multiples(dataset: xr.Dataset, fields: Sequence[str], forced: bool) -
     else:
         rows = [row for key in fields for row in split(parts[0], key)]
     titled = [*further[:2], *dict.fromkeys(own_dimension(dataset, key) for key in fields)]
-    sheet = maps(rows, (horizontal, vertical), height=1.8 if len(parts) > 1 else 2.5, titled=titled, forced=forced)
+    sheet = maps(rows, (horizontal, vertical), height=1.8 if len(parts) > 1 else 2.5, titled=titled)
     drawn = len(across) * len(down)
     return sheet.finish(dataset, f"{drawn} of {total} charts shown" if drawn < total else "")
 
@@ -431,62 +453,68 @@ def maps(
     *,
     height: float = 2.5,
     titled: Sequence[str] = (),
-    forced: bool = False,
 ) -> Sheet:
     """A sheet of maps over the axes ``names`` (horizontal, vertical): in each row one variable of several parts of a result.
 
-    Flags have their colours, spectral radii become growth, whose colour changes at the limit of stability, other variables
-    share a colour scale in all panels. Boundaries, tips, predicted resonances (``forced``: those that the forcing excites)
-    and thresholds are drawn over the panels, if stored. Titles give the coordinates ``titled`` of each part.
+    A variable has one colour scale in all panels; spectral radii become growth. Boundaries, tips, predicted resonances and
+    thresholds are drawn over the panels, if stored. Titles give the coordinates ``titled`` of each part.
     """
     sheet = Sheet(len(rows), len(rows[0][1]), height=height)
-    fields = [[valid(part, name) for part in parts] for name, parts in rows]
+    fields = [[_mapped(part, name) for part in parts] for name, parts in rows]
     alike = {name: [k for k, (other, _) in enumerate(rows) if other == name] for name, _ in rows}
-    scales: dict[str, dict[str, Any]] = {}
+    scales: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {}
     for name, numbers in alike.items():
         values = np.concatenate([field.values.ravel() for k in numbers for field in fields[k]])
         whole = xr.DataArray(values, attrs=fields[numbers[0]][0].attrs)
-        scales[name] = flag_scale(whole) if _flags(whole) else shades(whole.values)
+        scales[name] = colours(whole, growth_of(rows[0][1][0]) if _is_radius(name) else None)
         sheet.add(*(flag_entries(whole) if _flags(whole) else ()))
-    single, written = sheet.axes.size == len(rows), [""] * len(rows[0][1])
-    bars: dict[str, tuple[QuadMesh, str, dict[str, Any]]] = {}
+    single, titles, meshes = sheet.axes.size == len(rows), [""] * len(rows[0][1]), {}
     for k, (row, (name, parts)) in enumerate(zip(fields, rows, strict=True)):
-        above = written
-        written = [
-            ", ".join(_entry_text(part[name]) for name in titled if name in part.coords and not part[name].ndim)
-            for part in parts
-        ]
+        above, options = titles, scales[name][0]
+        coordinates = [[part[n] for n in titled if n in part.coords and not part[n].ndim] for part in parts]
+        titles = [", ".join(map(_entry_text, entries)) for entries in coordinates]
         for j, (axes, field, part) in enumerate(zip(sheet.axes[k], row, parts, strict=True)):
-            if _is_radius(name):
-                bars[name] = _draw_growth(axes, part, field, names)
+            flagged = bool(_flags(field))
+            if not flagged:
+                meshes[name] = draw_cells(
+                    axes, field.clip(options["norm"].vmin, options["norm"].vmax), *names, **options
+                )
+                sheet.add(*flag_entries(computed(part)))
             else:
-                mesh = draw_cells(axes, _above(field, scales[name]), names[0], names[1], **scales[name])
-                bars |= {} if _flags(field) else {name: (mesh, variable_label(field), {})}
-            sheet.add(*(() if _flags(field) else flag_entries(computed(part))))
+                draw_cells(axes, field, *names, **options)
             if name == "verdict" or _is_radius(name):
                 sheet.add(*overlays.draw_boundaries(axes, part, *names))
                 if single and k == 0:
                     sheet.add(*overlays.draw_tips(axes, part, *names))
                     sheet.later(partial(overlays.name_tips, axes, part, *names))
             # Not over other variables, so that narrow tongues stay visible there.
-            lines = overlays.predictions(part, names[0], names[1], forced) if name == rows[0][0] else []
-            sheet.add(*overlays.draw_predictions(axes, lines, below=bool(_flags(field))))
+            lines = overlays.predictions(part, *names) if name == rows[0][0] else []
+            sheet.add(*overlays.draw_predictions(axes, lines, below=flagged))
             if k == 0:
                 labelled = lines if single else [line for line in lines if line.order == 1]
                 sheet.later(partial(overlays.label_predictions, axes, labelled))
-            if written != above:
-                axes.set_title(written[j], pad=24 if k == 0 and lines else 4)
+            if titles != above:
+                axes.set_title(titles[j], pad=24 if k == 0 and lines else 4)
             sheet.add(*_draw_threshold(axes, part, *names))
     # Below the last rows, so that rows of flags without a colour bar keep the whole width.
-    last, flagged = list(alike)[-1], len(bars) < len(alike)
-    for name, bar in bars.items():
-        sheet.colorbar(alike[name], *bar, below=flagged and name == last)
+    for name, mesh in meshes.items():
+        below = len(meshes) < len(alike) and name == list(alike)[-1]
+        label = variable_label(fields[alike[name][0]][0])
+        sheet.colorbar(alike[name], mesh, label, scales[name][1], below=below)
     part = rows[0][1][0]
     if not single and not is_logarithmic(part[names[0]].values):
         # No tick at the right end, clear of the next panel.
         sheet.axes[0, 0].xaxis.set_major_locator(MaxNLocator(4, prune="upper"))
     sheet.label(axis_label(part[names[0]]), axis_label(part[names[1]]))
     return sheet
+
+
+def _mapped(part: xr.Dataset, name: str) -> xr.DataArray:
+    """The values that a map of a variable shows: growth for a spectral radius."""
+    if not _is_radius(name):
+        return valid(part, name)
+    growth = growth_of(part)
+    return growth.of(valid(part, name)).assign_attrs(long_name=growth.label, units="1")
 
 
 def own_dimension(dataset: xr.Dataset, name: str) -> str:
@@ -514,12 +542,6 @@ def entry_name(dimension: str, entry: object) -> str:
     return f"{entry} {dimension}" if isinstance(entry, str) else f"{dimension} {entry}"
 
 
-def _above(field: xr.DataArray, scale: Mapping[str, Any]) -> xr.DataArray:
-    """``field`` with zeros raised to the lower end of a logarithmic colour scale, where they are lightest."""
-    norm = scale.get("norm")
-    return field.clip(min=norm.vmin) if isinstance(norm, LogNorm) else field
-
-
 def _draw_threshold(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Line2D]:
     """Draw a predicted limit that is stored as a curve over the horizontal axis."""
     name = f"resonance_{vertical}"
@@ -538,14 +560,11 @@ def stack(
     dataset: xr.Dataset,
     along: str,
     panels: Sequence[Sequence[str]],
-    *,
-    forced: bool = False,
     **look: Any,
 ) -> Sheet:
     """A sheet of panels below each other over the axis ``along``, each with the variables of one entry of ``panels``.
 
-    Flags (verdict, regime, failed and pending points) are bands behind the lines. ``forced`` draws only those predicted
-    resonances that the forcing excites. ``look`` goes to :func:`draw_lines`.
+    Flags (verdict, regime, failed and pending points) are bands behind the lines. ``look`` goes to :func:`draw_lines`.
     """
     sheet = Sheet(len(panels), height=max(2.1, 3.0 / len(panels)), sharey=False)
     labels = [
@@ -553,7 +572,7 @@ def stack(
     ]
     fit_axis(sheet.axes[0, 0], "x", dataset[along].values)
     sheet.label(axis_label(dataset[along]), *labels)
-    lines = overlays.predictions(dataset, along, forced=forced)
+    lines = overlays.predictions(dataset, along)
     for (axes,) in sheet.axes:
         sheet.add(*overlays.draw_predictions(axes, lines))
     sheet.later(partial(overlays.label_predictions, sheet.axes[0, 0], lines))
@@ -582,7 +601,8 @@ def draw_lines(
     stability. Stored errors become bands. A scale is ``logarithmic`` for the keys named, if there are positive values.
     Unless ``named``, the lines are not in the legend. ``style`` goes to :meth:`matplotlib.axes.Axes.plot`.
     """
-    x, common = dataset[along].values, _common_words([str(dataset[key].attrs.get("long_name", key)) for key in keys])
+    titles = [str(dataset[key].attrs.get("long_name", key)).replace(",", "").split() for key in keys]
+    x, common = dataset[along].values, [word for word in titles[0] if all(word in title for title in titles)]
     if len(x) < _FEW:
         style = {"marker": "o", "markersize": 3} | style
     label = ""
@@ -597,7 +617,7 @@ def draw_lines(
         for k in range(values.sizes[own] if own else 1):
             line = values.isel({own: k}) if own else values
             names = [entry_name(own, line[own].item() if own in line.coords else k)] if own else []
-            names += [_without(str(dataset[key].attrs.get("long_name", key)), common)] if len(keys) > 1 else []
+            names += [" ".join(word for word in titles[number] if word not in common)] if len(keys) > 1 else []
             look: dict[str, Any] = {"color": colours[(k if own else number) % len(colours)], "label": ", ".join(names)}
             look |= {"linestyle": _DASHES[number if own else 0]} | style
             drawn = axes.plot(x, line, **look)
@@ -616,19 +636,6 @@ def draw_lines(
     elif axes.get_yscale() == "linear":
         widen(axes, "y", _LEAST_RANGE)
     return label if len(keys) == 1 else f"{' '.join(common)}{in_brackets(units_of(dataset[keys[0]]))}"
-
-
-def _common_words(names: list[str]) -> list[str]:
-    """The words that all ``names`` have."""
-    return [
-        word
-        for word in names[0].replace(",", "").split()
-        if all(word in name.replace(",", "").split() for name in names)
-    ]
-
-
-def _without(name: str, words: list[str]) -> str:
-    return " ".join(word for word in name.replace(",", "").split() if word not in words)
 
 
 def _scaled(dataset: xr.Dataset, values: xr.DataArray) -> tuple[xr.DataArray, str, xr.DataArray | None]:
@@ -675,3 +682,43 @@ def draw_flanks(dataset: xr.Dataset, along: Axes, portrait: Axes | None = None) 
         for side in (half, -half):
             axes.axvline(side, **LIMIT)
     return [along.axhline(side, label="flanks", **LIMIT) for side in (half, -half)][:1]
+
+
+def interference(dataset: xr.Dataset, orders: Orders, colours: Sequence[str], kinds: Mapping[str, str]) -> Figure:
+    """Interference (Campbell) diagram of one point: natural frequencies over the speed of a shaft, crossed by the lines of
+    its orders; ``colours`` of its modes, and the ``kinds`` of colours for the legend.
+
+    Crossings have their speeds as numbers, of many modes only those with the first order. With an operating range only its
+    surroundings are shown. Raises :class:`InputError` without a positive frequency.
+    """
+    stored = dataset[next(name for name in FREQUENCIES if name in dataset)]
+    require_values(stored, positive=True)
+    frequency = in_hertz(stored.values, stored.attrs["units"])
+    speeds = orders.speeds(frequency)
+    operating = operating_range(json.loads(dataset.attrs.get("options", "{}")))
+    high, top = _SPACE * np.nanmax(speeds[:, 0]), frequency.max()
+    if operating:
+        high = _BEYOND * operating[1]
+        reached = max(orders.per_turn.values()) * high / 60
+        top = np.max(frequency, initial=0.0, where=frequency <= reached) or reached
+    sheet = Sheet(height=4.2)
+    axes = sheet.axes[0, 0]
+    axes.set(xlim=(0, high), ylim=(0, _SPACE * top))
+    shown = np.flatnonzero(np.isfinite(speeds[:, 0]) & (frequency < _SPACE * top))
+    axes.hlines(frequency[shown], 0, high, colors=np.array(colours)[shown], linewidth=0.9)
+    names = [str(mode) for mode in dataset["mode"].values[shown]]
+    ends = np.stack([np.full(shown.size, high), frequency[shown]], axis=-1)
+    sheet.later(partial(write_names, axes, ends, names))
+    sheet.add(*(Line2D([], [], color=colour, label=kind) for kind, colour in kinds.items()))
+    for k, ((label, times), dashes) in enumerate(zip(orders.per_turn.items(), _ORDER_DASHES, strict=False)):
+        style = {"color": "black", "linewidth": 0.9, "linestyle": dashes, "label": f"{label} ({times:g}/turn)"}
+        sheet.add(*axes.plot([0, high], [0, times * high / 60], **style))
+        met = np.stack([speeds[shown, k], frequency[shown]], axis=-1)
+        met = met[met[:, 0] <= high]
+        axes.plot(*met.T, "o", markersize=3.5, color="black", markerfacecolor="white")
+        if k == 0 or operating or shown.size <= _FEW_MODES:
+            sheet.later(partial(write_names, axes, met, [f"{speed:.0f}" for speed in met[:, 0]], offset=4.0, **_NUMBER))
+    if operating:
+        sheet.add(axes.axvspan(*operating, color=LINE_COLOURS[1], alpha=0.2, zorder=0, label="operating speeds"))
+    sheet.label(f"speed of the {orders.shaft} [rpm]", "natural frequency [Hz] (number of the mode at the right)")
+    return sheet.finish(dataset)

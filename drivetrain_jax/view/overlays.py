@@ -19,12 +19,12 @@ from matplotlib.patheffects import withStroke
 from drivetrain_jax.view.sheet import write_names
 from drivetrain_jax.view.style import FLAG_COLOURS, FRAME_GREY, PREDICTION
 
+# Analyses of forced responses.
+_FORCED = ("forced", "frequency_response")
 _FAMILY_DASHES = {"solid": "-", "dashed": (0, (5, 2)), "dashdot": (0, (5, 1.5, 1, 1.5))}
 _MARK = {"marker": "o", "markersize": 3.0, "markerfacecolor": "white", "markeredgewidth": 0.7, "linestyle": "none"}
 # Type size of the name of a tip, its width and height, and its distance from the tip, in points.
 _FONT, _NAME, _BESIDE = 7.5, np.array([15.0, 9.0]), 3.5
-# Alignments of a text on the left, in the middle and on the right; below, beside and above.
-_ACROSS, _UP = ("right", "center", "left"), ("top", "center", "bottom")
 
 
 class Prediction(NamedTuple):
@@ -44,14 +44,13 @@ class Prediction(NamedTuple):
         return int(digits[-1]) if digits else 0
 
 
-def predictions(
-    dataset: xr.Dataset, horizontal: str, vertical: str | None = None, forced: bool = False
-) -> list[Prediction]:
-    """Predicted lines over ``horizontal``, with ``forced`` only of families that the forcing excites; [] without any."""
+def predictions(dataset: xr.Dataset, horizontal: str, vertical: str | None = None) -> list[Prediction]:
+    """Predicted lines over ``horizontal``, those of forced responses only of families that the forcing excites; [] without
+    any."""
     name = f"resonance_{horizontal}"
     if name not in dataset.coords:
         return []
-    lines = []
+    lines, forced = [], dataset.attrs.get("analysis") in _FORCED
     families = json.loads(dataset.attrs.get("resonance_families", "{}"))
     for index, label in enumerate(dataset["resonance"].values.astype(str)):
         family = _family(label, families)
@@ -146,8 +145,7 @@ def draw_tips(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -
 
 
 def name_tips(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> None:
-    """Write the names of tips outside of the tongues, or next to the tips; omit names that overlap, repeat or leave the
-    panel."""
+    """Write the names of tips outside of the tongues, or within them; omit names that overlap, repeat or leave the panel."""
     if "tip_proved" not in dataset.coords:
         return
     tips = np.stack([dataset[f"tip_{name}"].values for name in (horizontal, vertical)], axis=-1)
@@ -158,17 +156,17 @@ def name_tips(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -
     taken: list[np.ndarray] = []
     named: list[tuple[str, np.ndarray]] = []
     for name, tip, up in zip(dataset["tip"].values.astype(str), tips, opens, strict=True):
-        mark, outside = axes.transData.transform(tip) * scale, -1 if up else 1
+        mark = axes.transData.transform(tip) * scale
         # Unproved tips may lie within their errors of each other.
         if any(name == other and (np.abs(mark - place) < _NAME / 2).all() for other, place in named):
             continue
-        for side in np.array([(0, outside), (1, 0), (-1, 0), (0, -outside)]):
-            middle = mark + side * (0.7, 1.0) * _NAME
+        for side in (-1, 1) if up else (1, -1):
+            middle = mark + side * np.array([0.0, _NAME[1]])
             free = all((np.abs(middle - other) >= _NAME).any() for other in taken)
             if free and (middle >= low).all() and (middle <= high).all():
                 taken.append(middle)
                 named.append((name, mark))
-                style: dict[str, Any] = {"ha": _ACROSS[side[0] + 1], "va": _UP[side[1] + 1], "color": PREDICTION}
+                style: dict[str, Any] = {"ha": "center", "va": "bottom" if side > 0 else "top", "color": PREDICTION}
                 style |= {"size": _FONT, "path_effects": [withStroke(linewidth=2, foreground="white")]}
-                axes.annotate(label_text(name), tip, tuple(_BESIDE * side), textcoords="offset points", **style)
+                axes.annotate(label_text(name), tip, (0, _BESIDE * side), textcoords="offset points", **style)
                 break

@@ -239,17 +239,11 @@ def write_names(
 
 
 def _apart(wanted: np.ndarray, spacing: float, low: float, high: float) -> np.ndarray:
-    """The nearest places to the rising ``wanted`` ones that are ``spacing`` apart: isotonic regression by pooling."""
+    """The nearest places to the rising ``wanted`` ones that are ``spacing`` apart: the largest shift is least."""
     offsets = spacing * np.arange(len(wanted))
-    blocks: list[tuple[float, int]] = []
-    for value in wanted - offsets:
-        mean, count = value, 1
-        while blocks and blocks[-1][0] > mean:
-            before, number = blocks.pop()
-            mean, count = (before * number + mean * count) / (number + count), number + count
-        blocks.append((mean, count))
-    means, counts = np.array(blocks).T
-    return np.clip(np.repeat(means, counts.astype(int)), low, high - offsets[-1]) + offsets
+    free = wanted - offsets
+    middle = (np.maximum.accumulate(free) + np.minimum.accumulate(free[::-1])[::-1]) / 2
+    return np.clip(middle, low, high - offsets[-1]) + offsets
 
 
 def widen(axes: Axes, which: str, share: float, least: float = 0.0) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import re
-import tomllib
 from typing import Any
 
 import xarray as xr
 
-from drivetrain_jax.view.units import SUPERSCRIPTS, prefixed, unit_of, value_in, written_units
+from drivetrain_jax.view.units import SUPERSCRIPTS, prefixed, scene_of, unit_of, value_in, written_units
 
 # Passed to rc_context around every figure; global rcParams stay unchanged.
 STYLE: dict[Any, Any] = {
@@ -101,6 +101,31 @@ def scene_key(coordinate: xr.DataArray) -> str:
     return str(coordinate.attrs.get("parameter", coordinate.name))
 
 
+def parameters(dataset: xr.Dataset) -> dict[str, Any]:
+    """The parameters that do not vary, in their stored units: fixed ones, and axes of one value."""
+    fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}"))
+    fixed = {name: entry if isinstance(entry, dict) else {"value": entry} for name, entry in fixed.items()}
+    values = {name: _with_infinity(entry.get("value")) for name, entry in fixed.items()}
+    for coordinate in dataset.coords.values():
+        name, _, place = scene_key(coordinate).rstrip("]").partition("[")
+        if coordinate.ndim or coordinate.dtype.kind != "f":
+            continue
+        units = fixed.get(name, {}).get("units", coordinate.attrs.get("units", "1"))
+        number = float(value_in(coordinate, units))
+        if not place:
+            values[name] = number
+        elif int(place) < len(values.get(name, [])):
+            values[name][int(place)] = number
+    return values
+
+
+def _with_infinity(value: Any) -> Any:
+    """``value`` with infinity for the word by which JSON, which has none, holds it."""
+    if isinstance(value, list):
+        return [_with_infinity(entry) for entry in value]
+    return math.inf if value == "inf" else value
+
+
 def axis_label(coordinate: xr.DataArray) -> str:
     """``long name (symbol) [units]`` of a swept parameter, without a symbol that repeats the long name."""
     name, long_name = scene_key(coordinate), _long_name(coordinate)
@@ -187,8 +212,7 @@ def _given(dataset: xr.Dataset) -> dict[str, set[str]]:
     """Names of the parameters in each table of the scene; without a scene all are fixed."""
     if "scene" not in dataset.attrs:
         return {"fixed": set(json.loads(dataset.attrs.get("fixed_parameters", "{}")))}
-    scene = tomllib.loads(dataset.attrs["scene"])
-    return {table: set(scene.get(table, ())) for table in ("fixed", "axes", "points")}
+    return {table: set(scene_of(dataset).get(table, ())) for table in ("fixed", "axes", "points")}
 
 
 def _fixed_text(dataset: xr.Dataset, name: str, entry: Any) -> str:

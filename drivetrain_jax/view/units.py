@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -59,20 +60,24 @@ def size(units: str, unit: str) -> float | None:
 
 def suitable(units: str, asked: Iterable[str]) -> tuple[float, str]:
     """The unit among ``asked`` for a value in ``units``, and its factor; 1 and ``units`` without one."""
-    sizes = ((size(units, unit), unit) for unit in asked)
-    return next(((each, unit) for each, unit in sizes if each is not None), (1.0, units))
+    fitting = ((factor, unit) for unit in asked if (factor := size(units, unit)) is not None)
+    return next(fitting, (1.0, units))
 
 
-def in_units(dataset: xr.Dataset, asked: Sequence[str]) -> xr.Dataset:
-    """``dataset`` with axes, results and state in the units ``asked`` for, the first that fits each."""
-    changed = {
-        str(name): _changed(variable, *suitable(str(variable.attrs.get("units", "1")), asked))
-        for name, variable in dataset.variables.items()
-        if variable.dtype.kind in "fc"
-    }
-    state = [dict(each) for each in json.loads(dataset.attrs.get("state", "[]"))]
-    sizes = []
-    for component in state:
+def in_units(dataset: xr.Dataset, asked: Sequence[str] = ()) -> xr.Dataset:
+    """``dataset`` with axes, results and state in the units ``asked`` for, the first that fits each; other axes, and what
+    belongs to them, in the unit in which the scene gives them."""
+    dataset, changed = dataset.assign_attrs({ASKED: json.dumps(list(asked))}), {}
+    for name, variable in dataset.variables.items():
+        units = str(variable.attrs.get("units", "1"))
+        axis = dataset.coords.get(re.sub(r"^(?:boundary|tip|undecided|resonance)_|_error$", "", str(name)))
+        about = {} if axis is None else {"parameter": axis.name, "units": "1", **axis.attrs}
+        factor, unit = unit_of(dataset, str(about["parameter"]) if about.get("units") == units else "", units)
+        if unit != units and variable.dtype.kind in "fc":
+            attrs = {**variable.attrs, "units": unit, CONVERTED: 1}
+            changed[name] = variable.dims, variable.values * factor, attrs
+    components, sizes = json.loads(dataset.attrs.get("state", "[]")), []
+    for component in components:
         factor, component["units"] = suitable(component["units"], asked)
         component["scale"] = component.get("scale", 1.0) * factor / (sizes or [factor])[0]
         sizes.append(factor)
@@ -80,43 +85,27 @@ def in_units(dataset: xr.Dataset, asked: Sequence[str]) -> xr.Dataset:
         # A point of a section: a displacement and a rate.
         if "units_of_components" in variable.attrs and variable.sizes.get("state") == len(sizes):
             scaled = variable.values * np.array(sizes).reshape([-1 if d == "state" else 1 for d in variable.dims])
-            changed[str(name)] = xr.Variable(variable.dims, scaled, variable.attrs)
-    attrs = {ASKED: json.dumps(list(asked))} | ({"state": json.dumps(state)} if state else {})
-    return _assigned(dataset, changed).assign_attrs(attrs)
-
-
-def in_given_units(dataset: xr.Dataset) -> xr.Dataset:
-    """``dataset`` with each axis, and what belongs to it, in the unit in which its scene gives it."""
-    changed = {}
-    for axis in dataset.coords.values():
-        if axis.dtype.kind != "f" or (unit := given_unit(dataset, str(axis.attrs.get("parameter", axis.name)))) is None:
-            continue
-        units = str(axis.attrs.get("units", "1"))
-        of_axis = re.compile(rf"(?:boundary_|tip_|undecided_|resonance_)?{re.escape(str(axis.name))}(?:_error)?")
-        for name, variable in dataset.variables.items():
-            if of_axis.fullmatch(str(name)) and variable.attrs.get("units") == units:
-                changed[str(name)] = _changed(variable, *suitable(units, [unit]))
-    return _assigned(dataset, changed)
-
-
-def given_unit(dataset: xr.Dataset, name: str) -> str | None:
-    """The unit of the first text that the scene of ``dataset`` gives for ``name``; None without one."""
-    scene = tomllib.loads(str(dataset.attrs.get("scene", "")))
-    for table in ("axes", "points", "fixed"):
-        entry = scene.get(table, {}).get(name)
-        entries = entry.values() if isinstance(entry, dict) else [entry]
-        flat = (x for each in entries for x in (each if isinstance(each, list) else [each]))
-        found = next((_units.split(x) for x in flat if isinstance(x, str)), None)
-        if found and found[1]:
-            return found[1]
-    return None
+            changed[name] = variable.dims, scaled, variable.attrs
+    return _assigned(dataset, changed).assign_attrs({"state": json.dumps(components)} if components else {})
 
 
 def unit_of(dataset: xr.Dataset, name: str, units: str) -> tuple[float, str]:
-    """The unit in which figures show the fixed parameter ``name``, stored in ``units``, and its factor."""
-    factor, unit = suitable(units, json.loads(dataset.attrs.get(ASKED, "[]")))
-    given = given_unit(dataset, name) if unit == units else None
-    return suitable(units, [given]) if given else (factor, unit)
+    """The unit in which figures show the parameter ``name``, stored in ``units``: the one asked for, else that of the first
+    text that the scene gives for it; and the factor of the values."""
+    scene = scene_of(dataset)
+    entries = [scene.get(table, {}).get(name) for table in ("axes", "points", "fixed")]
+    entries = [part for entry in entries for part in (entry.values() if isinstance(entry, dict) else [entry])]
+    texts = [x for part in entries for x in (part if isinstance(part, list) else [part]) if isinstance(x, str)]
+    given = [written[1] for text in texts[:1] if (written := _units.split(text)) and written[1]]
+    return suitable(units, [*json.loads(dataset.attrs.get(ASKED, "[]")), *given])
+
+
+def scene_of(dataset: xr.Dataset) -> dict[str, Any]:
+    """The tables of the scene of ``dataset``; empty without one."""
+    return _parsed(str(dataset.attrs.get("scene", "")))
+
+
+_parsed = lru_cache(maxsize=8)(tomllib.loads)
 
 
 def value_in(variable: xr.DataArray, units: str) -> Any:
@@ -126,28 +115,23 @@ def value_in(variable: xr.DataArray, units: str) -> Any:
 
 def check_measured(dataset: xr.Dataset, asked: Iterable[str]) -> None:
     """Raise :class:`InputError` for a unit ``asked`` for that measures no parameter and no result of ``dataset``."""
-    units = [str(variable.attrs.get("units", "1")) for variable in dataset.variables.values()]
-    units += [component["units"] for component in json.loads(dataset.attrs.get("state", "[]"))]
+    components = json.loads(dataset.attrs.get("state", "[]"))
     fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}")).values()
-    units += [str(entry.get("units", "1")) for entry in fixed if isinstance(entry, dict)]
-    shown = [written_units(unit) for unit in dict.fromkeys(units) if unit not in ("1", "")]
+    described = [v.attrs for v in dataset.variables.values()] + components + [x for x in fixed if isinstance(x, dict)]
+    units = dict.fromkeys(str(about.get("units", "1")) for about in described)
+    remedy = " (a dimensionless speed needs physical data in the scene)"
     for unit in asked:
         if all(size(known, unit) is None for known in units):
-            kinds = f"units of {', '.join(shown)}" if shown else "none, all axes are dimensionless"
-            raise InputError(
-                f"units = {unit!r}: nothing in the result measures that; allowed are {kinds} "
-                "(a dimensionless speed needs physical data in the scene)"
-            )
+            raise InputError(f"units = {unit!r}: nothing in the result measures that; {allowed_units(units)}{remedy}")
 
 
-def _changed(variable: xr.Variable, factor: float, unit: str) -> xr.Variable:
-    if unit == variable.attrs.get("units", "1"):
-        return variable
-    attrs = {**variable.attrs, "units": unit, CONVERTED: 1}
-    return xr.Variable(variable.dims, variable.values * factor, attrs)
+def allowed_units(units: Iterable[str]) -> str:
+    """``allowed are ...`` with these units."""
+    shown = [written_units(unit) for unit in units if unit not in ("1", "")]
+    return f"allowed are units of {', '.join(shown)}" if shown else "allowed are none, all values are dimensionless"
 
 
-def _assigned(dataset: xr.Dataset, changed: dict[str, xr.Variable]) -> xr.Dataset:
+def _assigned(dataset: xr.Dataset, changed: Mapping[Hashable, Any]) -> xr.Dataset:
     coords = {name: variable for name, variable in changed.items() if name in dataset.coords}
     return dataset.assign({n: v for n, v in changed.items() if n not in coords}).assign_coords(coords)
 
@@ -182,5 +166,4 @@ def with_prefixes(dataset: xr.Dataset) -> xr.Dataset:
         key = units if name in dataset.data_vars else (axes or [name])[-1]
         factor, written = found.setdefault(key, prefixed(variable.values, units))
         changed[name] = (variable.dims, variable.values / factor, {**variable.attrs, "units": written})
-    coords = {name: values for name, values in changed.items() if name in dataset.coords}
-    return dataset.assign({n: v for n, v in changed.items() if n not in coords}).assign_coords(coords)
+    return _assigned(dataset, changed)

@@ -207,7 +207,7 @@ def test_wrong_input_of_a_rule_keeps_its_line(chart, monkeypatch):
     def refuse(*_):
         raise dt.InputError("rule 'own': fails")
 
-    monkeypatch.setattr("drivetrain_jax.invariants.verify.verify_dataset", refuse)
+    monkeypatch.setattr("drivetrain_jax.invariants.verify_dataset", refuse)
     with pytest.raises(dt.InputError, match=r"^rule 'own': fails$"):
         chart.drivetrain.verify()
 

@@ -18,8 +18,7 @@ import pytest
 import xarray as xr
 
 import drivetrain_jax as dt
-from drivetrain_jax.report.statements import statements
-from drivetrain_jax.report.tables import axes_table
+from drivetrain_jax.report.statements import axes_table, statements
 from drivetrain_jax.runs import job
 from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.scene import Problem, result_variables

@@ -10,8 +10,7 @@ import xarray as xr
 from drivetrain_jax import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.analysis import Outcome, analysis_names, get_analysis
-from drivetrain_jax.invariants import check, declared
-from drivetrain_jax.invariants.verify import verify
+from drivetrain_jax.invariants import check, declared, verify
 from drivetrain_jax.store.consolidate import write_result
 from drivetrain_jax.store.parts import PartsFolder
 from drivetrain_jax.systems import get_system, system_names

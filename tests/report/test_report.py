@@ -9,8 +9,7 @@ import xarray as xr
 import drivetrain_jax as dt
 from drivetrain_jax.cli import main
 from drivetrain_jax.report import report
-from drivetrain_jax.report.statements import statements
-from drivetrain_jax.report.tables import values_tables
+from drivetrain_jax.report.statements import statements, values_tables
 from tests.view import results
 
 HOSTILE = "</title><script>alert(1)</script>"

@@ -14,7 +14,7 @@ import drivetrain_jax as dt
 from drivetrain_jax import InputError
 from drivetrain_jax._threads import threads
 from drivetrain_jax.cli import main
-from drivetrain_jax.invariants.verify import verify
+from drivetrain_jax.invariants import verify
 from drivetrain_jax.runs import stores, toml
 from drivetrain_jax.runs.assemble import PENDING
 from drivetrain_jax.runs.output import status

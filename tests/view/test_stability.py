@@ -184,8 +184,8 @@ def test_single_point_shows_its_multipliers():
     circle, dots = panels(plot(point))[0].lines
     np.testing.assert_allclose(np.hypot(circle.get_xdata(), circle.get_ydata()), 1)
     np.testing.assert_array_equal(dots.get_xdata() + 1j * dots.get_ydata(), values)
-    with pytest.raises(InputError, match="needs floquet_multiplier"):
-        plot(point.rename(floquet_multiplier="liouville_residual"))
+    radius = xr.Dataset({"spectral_radius": 1.1, "outcome": np.int8(0)}, attrs={"analysis": "floquet"})
+    assert {"spectral_radius", "1.1"} <= set(texts(plot(radius)))
 
 
 def test_global_matplotlib_state_is_untouched():

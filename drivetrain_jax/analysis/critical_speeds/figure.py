@@ -18,7 +18,7 @@ from matplotlib.patheffects import withStroke
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.resonances import FREQUENCIES, operating_range, stored_orders
-from drivetrain_jax.view import charts, interference
+from drivetrain_jax.view import charts
 from drivetrain_jax.view.sheet import Sheet, is_logarithmic, plain_decades, write_names
 from drivetrain_jax.view.style import (
     FAILED_COLOUR,
@@ -26,11 +26,11 @@ from drivetrain_jax.view.style import (
     LINE_COLOURS,
     axis_label,
     in_brackets,
-    scene_key,
+    parameters,
     units_of,
     variable_label,
 )
-from drivetrain_jax.view.units import suitable, unit_of, value_in
+from drivetrain_jax.view.units import suitable, unit_of
 
 _MOST_SHAPES, _MOST_MAPS, _CONTOURS = 6, 4, 8
 # Line styles and colours of the orders, from the first on.
@@ -60,7 +60,7 @@ def plot(dataset: xr.Dataset) -> Figure:
     shown = next((name for name in ("critical_speed", *FREQUENCIES) if name in dataset), None)
     orders = stored_orders(dataset.attrs)
     if shown and not names and orders:
-        return interference.draw(dataset, orders, [to_hex(c) for c in _colours(dataset.sizes["mode"])], {})
+        return charts.interference(dataset, orders, [to_hex(c) for c in _colours(dataset.sizes["mode"])], {})
     if shown is None or not names:
         stored = ", ".join(str(name) for name in dataset.data_vars)
         needed = "an axis and one of " + ", ".join(FREQUENCIES) if names else "mode_shape, or an axis"
@@ -178,17 +178,7 @@ def _shapes(dataset: xr.Dataset) -> Figure:
 def _shaft(dataset: xr.Dataset) -> tuple[list[float], list[float], dict[str, list[float]]]:
     """Ends of the segments (in the unit of the figure), their thickness, and the places of supports, masses and hinges, from
     the fixed parameters, axes of one value among them; without stored lengths a length of 1 without thickness."""
-    given = json.loads(dataset.attrs.get("fixed_parameters", "{}"))
-    fixed = {name: x["value"] for name, x in given.items()}
-    for coordinate in dataset.coords.values():
-        name, _, place = scene_key(coordinate).rstrip("]").partition("[")
-        if coordinate.ndim or coordinate.dtype.kind != "f":
-            continue
-        number = float(value_in(coordinate, given.get(name, {}).get("units", "1")))
-        if not place:
-            fixed[name] = number
-        elif int(place) < len(fixed.get(name, [])):
-            fixed[name][int(place)] = number
+    fixed = parameters(dataset)
     if not {"length", "EI"} <= fixed.keys():
         return [0.0, 1.0], [], {}
     edges = [0.0, *np.cumsum(unit_of(dataset, "length", "m")[0] * np.array(fixed["length"])).tolist()]

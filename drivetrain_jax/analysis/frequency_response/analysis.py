@@ -26,7 +26,7 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax._rules import FREQUENCY_RESPONSE
+from drivetrain_jax._rules import BUILT_IN
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver, finite_results
 from drivetrain_jax.analysis.frequency_response import closed_form_response, harmonic_response, orbit_branches
 from drivetrain_jax.analysis.frequency_response.harmonic_balance import Basis
@@ -170,7 +170,9 @@ def _solve(
     if request.method != "exact":
         results |= {"outcome": jnp.where(_in_range(model), results["outcome"], Outcome.NOT_FINITE).astype(jnp.int8)}
         results |= _without(results["outcome"] == Outcome.NOT_FINITE, results)
-    return finite_results(results, path=True, gaps=FREQUENCY_RESPONSE.gaps, infinite=("peak_amplitude", "fit_range"))
+    return finite_results(
+        results, path=True, gaps=BUILT_IN["frequency_response"].gaps, infinite=("peak_amplitude", "fit_range")
+    )
 
 
 def _in_range(model: PiecewiseLinearOscillator) -> Array:

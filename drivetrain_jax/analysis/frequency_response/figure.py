@@ -10,6 +10,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import charts, overlays
@@ -21,6 +22,7 @@ from drivetrain_jax.view.style import (
     LINE_COLOURS,
     axis_label,
     in_brackets,
+    parameters,
     units_of,
     variable_label,
 )
@@ -67,7 +69,7 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
         return _orbits(dataset, path)
     if not others and len(names) == 2:
         parts = [dataset.sel(sweep_direction=direction) for direction in _DIRECTIONS]
-        rows = [(name, parts) for name in charts.require_any(dataset, "u_max", "regime")]
+        rows = [(name, parts) for name in charts.require(dataset, "u_max", "regime", some=True)]
         axes = charts.horizontal_first(dataset, names)
         return charts.maps(rows, axes, titled=["sweep_direction"]).finish(dataset)
     for result in results:
@@ -86,7 +88,7 @@ def _method(result: xr.Dataset) -> str:
 def _check_comparable(results: list[xr.Dataset]) -> None:
     """Raise :class:`InputError` unless all results have the same parameters, shown in the heading, and differ in the
     legend."""
-    first, *others = (_fixed_values(result) for result in results)
+    first, *others = map(parameters, results)
     for other in others:
         for name in first | other:
             if first.get(name) != other.get(name):
@@ -97,13 +99,6 @@ def _check_comparable(results: list[xr.Dataset]) -> None:
     for label in labels:
         if labels.count(label) > 1:
             raise InputError(f"files: {label!r} is given twice; allowed is every method once")
-
-
-def _fixed_values(result: xr.Dataset) -> dict[str, object]:
-    """Parameters of ``result`` that do not vary, axes of one value included."""
-    fixed = json.loads(result.attrs.get("fixed_parameters", "{}"))
-    values = {name: entry.get("value") if isinstance(entry, dict) else entry for name, entry in fixed.items()}
-    return values | {str(name): c.item() for name, c in result.coords.items() if c.ndim == 0}
 
 
 def _label(result: xr.Dataset) -> str:
@@ -148,8 +143,10 @@ def _lines(results: list[xr.Dataset], path: str) -> Figure:
         regime = charts.valid(best, "regime")
         for foot, direction in ((1.01, "down"), (1.055, "up")):
             charts.draw_flags(upper, regime.sel(sweep_direction=direction), path, (foot, foot + 0.035))
-            place = {"transform": upper.transAxes, "va": "center", "size": 6.5, "color": FRAME_GREY}
-            upper.text(1.005, foot + 0.0175, direction, **place)
+            place: dict[str, Any] = {"transform": upper.transAxes, "color": FRAME_GREY}
+            # A frame, because the colour of motions without separation is none.
+            upper.add_patch(Rectangle((0, foot), 1, 0.035, fill=False, linewidth=0.4, clip_on=False, **place))
+            upper.text(1.005, foot + 0.0175, direction, va="center", size=6.5, **place)
         sheet.add(*charts.flag_entries(regime))
     half = charts.half_play(best)
     if half is not None and half < upper.get_ylim()[1]:
@@ -281,7 +278,7 @@ def _orbits(dataset: xr.Dataset, path: str) -> Figure:
     amplitude, x = dataset["branch_amplitude"], dataset[path].values
     (own,) = (str(dim) for dim in amplitude.dims if dim not in (path, "branch"))
     sheet = Sheet(amplitude.sizes[own], height=2.6, sharey=False)
-    lines = overlays.predictions(dataset, path, forced=True)
+    lines = overlays.predictions(dataset, path)
     stability = dataset["branch_stability"].transpose(path, "branch").values
     for (axes,), name, colour in zip(sheet.axes, amplitude[own].values.tolist(), LINE_COLOURS, strict=False):
         values = amplitude.sel({own: name}).transpose(path, "branch").values

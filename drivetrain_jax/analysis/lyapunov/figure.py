@@ -28,7 +28,7 @@ def plot(dataset: xr.Dataset) -> Figure:
             spectrum = largest["lyapunov_spectrum"].assign_attrs(long_name="largest Lyapunov exponent")
             largest = largest.assign(lyapunov_spectrum=spectrum)
         return charts.chart(largest, fields=["verdict", "lyapunov_spectrum"])
-    shown = charts.require_any(dataset, *_CURVES)
+    shown = charts.require(dataset, *_CURVES, some=True)
     sheet = charts.stack(dataset, names[0], [[key] for key in shown], marker=".", markersize=2.5)
     for (axes,), key in zip(sheet.axes, shown, strict=True):
         axes.axhline(0, color=FRAME_GREY, linewidth=0.6, zorder=0)

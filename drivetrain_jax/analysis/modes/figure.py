@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from typing import Any
@@ -17,10 +16,9 @@ from matplotlib.lines import Line2D
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.resonances import Orders, stored_orders
-from drivetrain_jax.view import charts, interference
+from drivetrain_jax.view import charts
 from drivetrain_jax.view.sheet import Sheet, fit_axis, plain_decades, write_names
-from drivetrain_jax.view.style import FRAME_GREY, axis_label, in_brackets, scene_key, units_of, variable_label
-from drivetrain_jax.view.units import value_in
+from drivetrain_jax.view.style import FRAME_GREY, axis_label, in_brackets, parameters, units_of, variable_label
 
 # Colours of rigid modes, of the families in their order, and of coupled modes.
 _RIGID, _FAMILIES, _COUPLED = "#9a9a9a", ("#16324f", "#d1771e", "#3f8f5f", "#7a4fa0", "#999933"), "#a0308c"
@@ -127,7 +125,7 @@ def _interference(dataset: xr.Dataset, orders: Orders) -> Figure:
     types, colours = _types(dataset, dominant=True).tolist(), type_colours(dataset)
     kinds = {kind: colour for kind, colour in colours.items() if kind in types and kind != "rigid"}
     kinds = kinds if "mode_type" in dataset else {}
-    return interference.draw(dataset, orders, [colours[kind] for kind in types], kinds)
+    return charts.interference(dataset, orders, [colours[kind] for kind in types], kinds)
 
 
 def _close(frequency: np.ndarray) -> list[int]:
@@ -168,12 +166,10 @@ def _segments(x: np.ndarray, curve: np.ndarray, colours: list[str]) -> LineColle
 def _angles(dataset: xr.Dataset) -> list[float]:
     """Angles of the planets, from the fixed parameters or from scalar coordinates of single entries."""
     name = charts.role(dataset, "planets")
-    fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}")).get(name)
-    if fixed is None:
+    angles = parameters(dataset).get(name)
+    if angles is None:
         raise InputError(f"{name or 'planets'}: missing; the figure of mode shapes needs the angles of planets")
-    varied = {scene_key(c): value_in(c, "rad") for c in dataset.coords.values() if not c.ndim and c.dtype.kind == "f"}
-    angles = enumerate(fixed["value"] if isinstance(fixed, dict) else fixed)
-    return [float(varied.get(f"{name}[{i}]", angle)) for i, angle in angles]
+    return [float(angle) for angle in angles]
 
 
 def _distinct(frequency: np.ndarray) -> list[tuple[int, int]]:

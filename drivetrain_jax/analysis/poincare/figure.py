@@ -25,7 +25,7 @@ def plot(dataset: xr.Dataset) -> Figure:
     One axis of up to six values gives one row for each value. Raises :class:`InputError` for more axes or values, and
     unless ``section`` is stored.
     """
-    charts.require_any(dataset, "section")
+    charts.require(dataset, "section", some=True)
     names = charts.sweep_axes(dataset)
     if len(names) > 1 or (names and dataset.sizes[names[0]] > _MOST_ROWS):
         raise charts.wrong_axes(dataset, f"one axis of up to {_MOST_ROWS} values")

@@ -54,7 +54,7 @@ def plot(dataset: xr.Dataset) -> Figure:
 
 
 def _curves(dataset: xr.Dataset, name: str) -> Figure:
-    extremes = charts.require_any(dataset, "u_max", "u_min")
+    extremes = charts.require(dataset, "u_max", "u_min", some=True)
     dots: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 1.8}
     sheet = charts.stack(dataset, name, [extremes, *([key] for key in _CURVES if key in dataset)], **dots)
     first = sheet.axes[0, 0]
