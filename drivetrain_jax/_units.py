@@ -116,7 +116,7 @@ def factor(unit: str, units: str) -> float:
     if given.dimensionality != wanted.dimensionality and "/rad" in units:
         given = given / _parsed("rad")
     if given.dimensionality != wanted.dimensionality:
-        raise UnitError(f"{unit} does not measure that")
+        raise UnitError(f"{unit} is a unit of another quantity")
     exact = float((given / wanted).to_base_units().magnitude)
     # A power of ten is written exactly, whatever way led to it.
     short = float(f"{exact:.12g}")

@@ -354,7 +354,8 @@ def speed_windows(
     """The stable ranges of speed, shortened by ``margin`` times the speed at either end, within a range of speeds if one is
     given. Raises as :func:`query`."""
     if not 0 <= margin < 1:
-        raise InputError(f"margin = {margin!r}: allowed is 0 <= margin < 1")
+        meant = f"; did you mean {margin:g} %?" if 1 <= margin < 100 else ""
+        raise InputError(f"margin = {margin!r}: allowed is 0 <= margin < 1{meant}")
     (speed,) = roles_of(atlas, "speed")
     asked = replace(AtlasQuery.of(atlas, given, ranges=(), free=(speed,), within=(speed,)), show=show)
     panels = atlas.stability.atlas

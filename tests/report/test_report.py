@@ -133,7 +133,7 @@ def test_a_unit_that_nothing_measures_is_refused(truck, files, tmp_path, capsys)
         ("--units", "kg m", "units = 'kg m': nothing in the report measures that; allowed are units of"),
         ("--units", "rpm,Hz", "units = 'Hz': measures the same as rpm"),
         ("--amplitude", "2 deg", "amplitude = '2 deg': no result has a forced motion to compare"),
-        ("--amplitude", "2 mm", "mm does not measure that"),
+        ("--amplitude", "2 mm", "mm is a unit of another quantity"),
     ):
         results = {"2 mm": truck, "2 deg": files[1:]}.get(value, truck[:1])
         assert main(["report", *map(str, results), "--out", str(tmp_path / "r.html"), option, value]) == 2

@@ -466,7 +466,7 @@ def test_design_answers_are_checked_by_direct_solves(atlas):
         atlas_answers.least_damping(atlas, {"Omega": (1.0, 1.2)})
     with pytest.raises(dt.InputError, match=r"^Omega = 1\.2: a range is needed"):
         atlas_answers.widest_angle(atlas, {"Omega": 1.2})
-    with pytest.raises(dt.InputError, match=r"^margin = 2: allowed is 0 <= margin < 1$"):
+    with pytest.raises(dt.InputError, match=r"^margin = 2: allowed is 0 <= margin < 1; did you mean 2 %\?$"):
         atlas_answers.speed_windows(atlas, {"beta": 0.31}, margin=2)
 
 
