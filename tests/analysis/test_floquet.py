@@ -28,14 +28,23 @@ def random_points(count: int, seed: int) -> dict[str, np.ndarray]:
     return {"beta": rng.uniform(-1.5, 1.5, count)} | points
 
 
+# Multipliers below the rounding of the matrix need a march of their own, which takes as long to compile as all the rest.
+RADIUS = tuple(name for name in EVERYTHING if not name.startswith("floquet_multiplier"))
+
+
 @pytest.fixture(scope="module")
 def direct():
+    return FloquetBatch("direct", outputs=RADIUS)
+
+
+@pytest.fixture(scope="module")
+def everything():
     return FloquetBatch("direct")
 
 
 @pytest.fixture(scope="module")
 def diffrax():
-    return FloquetBatch("diffrax", outputs=("spectral_radius", "floquet_multiplier"), chunk=(4,))
+    return FloquetBatch("diffrax", outputs=("spectral_radius",), chunk=(4,))
 
 
 @pytest.fixture(scope="module")
@@ -212,8 +221,10 @@ def test_error_follows_the_tolerance(direct, sample):
     assert (error[easy] <= 10 * rtol * exact[easy]).all()
 
 
-def test_multipliers_and_their_largest_modulus(sample):
-    points, found, _ = sample
+@pytest.mark.full
+def test_multipliers_and_their_largest_modulus(everything):
+    points = random_points(200, 13)
+    found = everything(points)
     moduli = np.abs(found["floquet_multiplier"])
     np.testing.assert_allclose(moduli[:, 0], found["spectral_radius"], rtol=1e-9)
     assert not (np.diff(moduli, axis=1) > 2e-9 * moduli[:, :1]).any()
@@ -224,9 +235,9 @@ def test_multipliers_and_their_largest_modulus(sample):
 
 
 @pytest.mark.full
-def test_sign_of_the_joint_angle_does_not_matter(direct):
+def test_sign_of_the_joint_angle_does_not_matter(everything):
     points = random_points(64, 17)
-    found, mirrored = direct(points), direct(points | {"beta": -points["beta"]})
+    found, mirrored = everything(points), everything(points | {"beta": -points["beta"]})
     for name in EVERYTHING:
         np.testing.assert_array_equal(found[name], mirrored[name])
 
@@ -260,12 +271,12 @@ def test_unit_of_time_does_not_matter(direct):
         "mu": 80.0 / 55.0,
         "gamma": 4.2 / 0.3,
     }
-    multipliers = direct(groups)["floquet_multiplier"][0]
+    rho = direct(groups)["spectral_radius"][0]
     for unit in (1.0, 60.0, 0.1):
         powers = {"k1": 2, "k2": 2, "c1": 1, "c2": 1, "Omega0": 1}
         scaled = {name: value * unit ** powers.get(name, 0) for name, value in machine.items()}
-        expected = np.linalg.eigvals(physical_monodromy(scaled))
-        np.testing.assert_allclose(np.poly(multipliers), np.poly(expected), rtol=0, atol=1e-9)
+        expected = np.abs(np.linalg.eigvals(physical_monodromy(scaled))).max()
+        assert rho == pytest.approx(expected, abs=1e-9)
 
 
 def test_without_damping_the_motion_is_bounded_outside_the_tongues(direct):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import diffrax
 import jax
@@ -15,6 +16,7 @@ from drivetrain_jax.analysis.floquet.direct import Propagator, assemble
 from drivetrain_jax.analysis.floquet.multipliers import spectral_radius_bound
 from drivetrain_jax.analysis.floquet.propagator import ORDER, STAGES, Gauss, LinearTerm, march, monodromy
 from drivetrain_jax.analysis.numerics.collocation import first_order, gauss, panel, radau, second_order
+from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last, traced_once
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
 from drivetrain_jax.systems import LinearPeriodic
 from tests.sizes import full_after
@@ -275,3 +277,19 @@ def test_a_fourfold_coarser_solution_shows_the_same_error(panels):
         error = np.linalg.norm(np.asarray(found.matrix) - exact)
         assert bool(found.met) and error <= float(found.error) * np.linalg.norm(exact)
         assert error <= np.linalg.norm(np.asarray(found.change)) <= 200 * error
+
+
+def test_the_trace_of_one_point_serves_the_expected_batch(retraced):
+    traced = []
+
+    def triple(constants, x, factor):
+        traced.append(x.shape)
+        return factor * x
+
+    def one(x):
+        return lanes_last(partial(traced_once, triple), Constants(None), x, jnp.asarray(3.0), expected=5)
+
+    np.testing.assert_array_equal(jax.jit(jax.vmap(one))(jnp.arange(5.0)), 3.0 * np.arange(5))
+    assert traced == [(5,)]
+    np.testing.assert_array_equal(jax.vmap(one)(jnp.arange(7.0)), 3.0 * np.arange(7))
+    assert float(one(jnp.asarray(2.0))) == 6.0 and traced == [(5,), (7,)]

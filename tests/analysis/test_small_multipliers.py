@@ -15,6 +15,7 @@ from tests.quick_jit import quick_jit
 from tests.sizes import full_after
 
 RATES = {
+    "three": [9.0, -1.0, -9.0],
     "decay": [-1.0, -4.0, -9.0, -20.0],
     "growth": [9.0, 1.0, -1.0, -9.0],
     "equal sizes": [-1.0, -1.0, -15.0, -15.5],
@@ -30,21 +31,22 @@ class Turning(eqx.Module):
 
     def rows(self, t):
         # S = T R(t) with a rotation by t of the first and the third component: S' S^-1 + S D S^-1.
-        c, s = jnp.cos(t), jnp.sin(t)
-        zero, one = jnp.zeros_like(c), jnp.ones_like(c)
-        turn = [[c, zero, -s, zero], [zero, one, zero, zero], [s, zero, c, zero], [zero, zero, zero, one]]
-        inner = [[sum(turn[i][k] * self.rates[k] * turn[j][k] for k in range(4)) for j in range(4)] for i in range(4)]
+        n, c, s = len(self.mixing), jnp.cos(t), jnp.sin(t)
+        turn = [[jnp.full_like(c, float(i == j)) for j in range(n)] for i in range(n)]
+        turn[0][0], turn[0][2], turn[2][0], turn[2][2] = c, -s, s, c
+        inner = [[sum(turn[i][k] * self.rates[k] * turn[j][k] for k in range(n)) for j in range(n)] for i in range(n)]
         inner[0][2], inner[2][0] = inner[0][2] - 1, inner[2][0] + 1
-        back = jnp.asarray(np.linalg.inv(MIXING))
+        back = jnp.asarray(np.linalg.inv(mixing(n)))
         return tuple(
             tuple(
-                sum(self.mixing[i, k] * inner[k][m] * back[m, j] for k in range(4) for m in range(4)) for j in range(4)
+                sum(self.mixing[i, k] * inner[k][m] * back[m, j] for k in range(n) for m in range(n)) for j in range(n)
             )
-            for i in range(4)
+            for i in range(n)
         )
 
 
-MIXING = np.eye(4) + 0.3 * np.random.default_rng(0).normal(size=(4, 4))
+def mixing(n):
+    return np.eye(n) + 0.3 * np.random.default_rng(0).normal(size=(n, n))
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +60,7 @@ def graded():
 @pytest.mark.parametrize("kind", full_after(1, RATES))
 def test_small_multipliers_lie_within_their_errors(graded, kind):
     rates = np.array(RATES[kind])
-    logs, sigma, errors = map(np.asarray, graded(jnp.asarray(rates), jnp.asarray(MIXING)))
+    logs, sigma, errors = map(np.asarray, graded(jnp.asarray(rates), jnp.asarray(mixing(len(rates)))))
     exact = np.sort(2 * np.pi * rates)[::-1]
     wrong = np.abs(sigma - np.exp(exact - logs))
     assert (wrong <= errors).all(), (wrong, errors)

@@ -15,6 +15,7 @@ from scipy.special import mathieu_a, mathieu_b
 import drivetrain_jax as dt
 from drivetrain_jax.invariants import check
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System, parameter, serves
+from tests.sizes import full_after
 
 OUTPUTS = ["spectral_radius", "spectral_radius_error", "verdict"]
 
@@ -61,7 +62,7 @@ def bounded(a: np.ndarray, q: np.ndarray) -> np.ndarray:
     return np.any([(mathieu_a(n, q) < a) & (a < mathieu_b(n + 1, q)) for n in range(8)], axis=0)
 
 
-@pytest.mark.parametrize("method", ["direct", "diffrax"])
+@pytest.mark.parametrize("method", full_after(1, ["direct", "diffrax"]))
 def test_an_ince_strutt_diagram_has_stable_regions(method):
     found = jax.vmap(lambda a, q: dt.floquet(Mathieu(a=a, q=q), outputs=OUTPUTS, method=method))(A.ravel(), Q.ravel())
     expected = bounded(A, Q).ravel()
@@ -83,7 +84,7 @@ EDGES = np.array([
 ]).T  # fmt: skip
 
 
-@pytest.mark.parametrize("method", ["direct", pytest.param("diffrax", marks=pytest.mark.full)])
+@pytest.mark.parametrize("method", full_after(1, ["direct", "diffrax"]))
 def test_bounds_hold_where_solutions_grow_within_the_period(method):
     a, q, above = EDGES
     exact = np.where(above > 0, 1 + above + np.sqrt(np.maximum(above * (2 + above), 0)), 1.0)
@@ -122,9 +123,11 @@ def test_masses_without_damping():
     assert found.verdict.tolist() == (1 - expected).ravel().tolist() and expected.sum() > 10
 
 
-@pytest.mark.parametrize("changes", [{"damping": 1e-15}, {"damping": -1e-15}, {"twist": 1e-12}, {"a": 4.0, "q": 0.0}])
+@pytest.mark.parametrize(
+    "changes", full_after(3, [{"damping": 1e-15}, {"damping": -1e-15}, {"a": 4.0, "q": 0.0}, {"twist": 1e-12}])
+)
 def test_what_may_grow_is_not_called_stable(changes):
-    """The last one has a double multiplier at 1."""
+    """At a = 4, q = 0 there is a double multiplier at 1."""
     given = {"a": 2.0, "q": 0.5} | changes
     system = TwoMasses if "twist" in changes else Mathieu
     assert int(dt.floquet(system(**given), outputs=["verdict"]).verdict) == 2

@@ -12,7 +12,7 @@ from jax import Array
 from drivetrain_jax.analysis._base import Solver
 from drivetrain_jax.analysis.floquet.direct import Monodromy
 from drivetrain_jax.analysis.floquet.effort import fastest_rate, panels_needed, strongly_damped, traced_panels
-from drivetrain_jax.analysis.numerics.lanes import over_lanes
+from drivetrain_jax.analysis.numerics.lanes import lane_count, over_lanes
 from drivetrain_jax.systems import System
 
 if TYPE_CHECKING:
@@ -50,16 +50,16 @@ def direct_solvers(
             # Local import: diffrax takes as long as jax, and only tracing needs it.
             from drivetrain_jax.analysis.floquet.propagator import factored, monodromy
 
-            model = build(values)
+            model, lanes = build(values), lane_count(values)
             ratio = jnp.where(target <= _FINE, _RATIO, 2) if model.panels is not None else 2
 
             def one(own: Mapping[str, Any], panels: Array) -> Monodromy:
-                return monodromy(form(build(own)), panels, target, ratio)
+                return monodromy(form(build(own)), panels, target, ratio, lanes)
 
             def factors() -> Factored:
                 # Gauss schemes need panels in proportion to fast decays and growths.
                 count = jnp.maximum(panels, jnp.minimum(fastest_rate(form(model)), _MOST_FACTORS).astype(int))
-                return over_lanes(lambda own, count: factored(form(build(own)), count))(values, count)
+                return over_lanes(lambda own, count: factored(form(build(own)), count, lanes))(values, count)
 
             return results(model, over_lanes(one)(values, panels), factors)
 

@@ -91,6 +91,8 @@ class Gauss(diffrax.AbstractSolver):
     panels: Any
     rtol: Any
     ratio: Any = 2
+    # Of the batch that the point is expected to be a part of: its trace is that of the batch.
+    lanes: int = eqx.field(static=True, default=1)
     term_structure: ClassVar = LinearTerm
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
@@ -119,14 +121,14 @@ class Gauss(diffrax.AbstractSolver):
     def solved(self, system: LinearPeriodic) -> tuple[Array, Monodromy]:
         """The propagator over the span, and the monodromy matrix."""
         shared = jnp.asarray(self.panels), jnp.asarray(self.rtol, float), jnp.asarray(self.ratio)
-        return _of_one(_refined, system, shared)
+        return _of_one(_refined, system, shared, self.lanes)
 
 
-def monodromy(system: LinearPeriodic, panels: Array, rtol: Any, ratio: Any = 2) -> Monodromy:
-    """The monodromy matrix of one point, from ``panels`` predicted panels on."""
+def monodromy(system: LinearPeriodic, panels: Array, rtol: Any, ratio: Any = 2, lanes: int = 1) -> Monodromy:
+    """The monodromy matrix of one point of a batch of ``lanes``, from ``panels`` predicted panels on."""
     end = diffrax.diffeqsolve(
         LinearTerm(system),
-        Gauss(panels, rtol, ratio),
+        Gauss(panels, rtol, ratio, lanes),
         t0=0.0,
         t1=1.0,
         dt0=None,
@@ -149,18 +151,18 @@ def march(system: LinearPeriodic, count: Array) -> Propagator:
     return jax.tree.map(lambda x: x[..., 0], state.propagator(count * len(system.parts)))
 
 
-def factored(system: LinearPeriodic, panels: Array) -> Factored:
-    """The :class:`Factored` monodromy matrix of one point in ``panels`` panels and in twice as many, the first axis."""
-    return _of_one(_in_factors, system, (jnp.asarray(panels),))
+def factored(system: LinearPeriodic, panels: Array, lanes: int = 1) -> Factored:
+    """The :class:`Factored` matrix of one point of a batch, in ``panels`` panels and in twice as many, the first axis."""
+    return _of_one(_in_factors, system, (jnp.asarray(panels),), lanes)
 
 
-def _of_one(compute: Callable[..., Any], system: LinearPeriodic, shared: tuple[Array, ...]) -> Any:
+def _of_one(compute: Callable[..., Any], system: LinearPeriodic, shared: tuple[Array, ...], lanes: int) -> Any:
     """``compute(constants, arrays, shared)`` of one system, the last axis of its results being the lanes."""
     arrays, rest = eqx.partition(system, eqx.is_array)
     if not jax.tree.leaves(arrays) or not system.is_pytree:
         # No arrays to batch, or a function that may depend on unknown arrays.
         return jax.tree.map(lambda x: x[..., 0], compute(Constants(rest), arrays, shared))
-    return lanes_last(partial(traced_once, compute), Constants(rest), arrays, shared)
+    return lanes_last(partial(traced_once, compute), Constants(rest), arrays, shared, expected=lanes)
 
 
 def _in_factors(fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array]) -> Factored:

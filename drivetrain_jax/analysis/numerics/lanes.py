@@ -109,7 +109,12 @@ class Constants:
 
 
 def lanes_last(
-    function: Callable[[Any, Any, Any], Any], constants: Constants, varying: Any, shared: Any, size: int | None = None
+    function: Callable[[Any, Any, Any], Any],
+    constants: Constants,
+    varying: Any,
+    shared: Any,
+    size: int | None = None,
+    expected: int = 1,
 ) -> Any:
     """``function(constants, varying, shared)`` of one point; under ``jax.vmap``, even nested, one call for all lanes.
 
@@ -117,13 +122,19 @@ def lanes_last(
     all lanes have a last axis of length 1; numbers have none. ``shared`` applies to all lanes: different integers become
     their maximum, other values an array of lanes. With ``size``, ``function`` runs on blocks of this number of lanes and is
     traced only for this number, once for equal ``constants``. A batch that fits into one vector is computed as a whole.
+    A cached trace of ``function`` for the ``expected`` number of lanes serves the single point, which jax traces before it
+    batches.
     """
     at_once = partial(_at_once, function, constants)
 
     @custom_vmap
     def call(varying: Any, shared: Any) -> Any:
         # A single point is padded to a block, because it would need another trace.
-        return at_once(varying, shared, size)
+        lanes = max(x.shape[-1] for x in jax.tree.leaves(varying))
+        if lanes >= expected:
+            return at_once(varying, shared, size)
+        whole = jax.tree.map(lambda x: _padded(x, expected) if x.shape[-1] == lanes else x, varying)
+        return jax.tree.map(lambda x: x[..., :lanes], at_once(whole, shared, size))
 
     @call.def_vmap
     def rule(batch: int, batched: Any, varying: Any, shared: Any) -> Any:
