@@ -15,7 +15,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -51,20 +51,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if getattr(sys, name) is None:
             # The parent process has closed this stream, so no one reads its output.
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+        if arguments is None and isinstance(stream := getattr(sys, name), io.TextIOWrapper):
+            # The encoding of a terminal may lack characters of a title.
+            stream.reconfigure(errors="backslashreplace")
     options = parser().parse_args(arguments)
     try:
         return options.command(options)
     except (InputError, ChunkError) as error:
         sys.stderr.write(one_line(str(error)))
         return INCOMPLETE if isinstance(error, ChunkError) else WRONG_INPUT
-    except BrokenPipeError:
-        # The reader has closed standard output (``drivetrain list | head``): exit without a message.
-        _drop_output()
-        return OK
     except OSError as error:
-        if error.filename is None:
+        if error.filename is None and error.errno is None:
             raise
-        sys.stderr.write(one_line(f"{error.filename}: {error.strerror}"))
+        if error.filename is None:
+            # Python would try to write buffered output again at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):
+            # The reader has closed standard output (``drivetrain list | head``): exit without a message.
+            return OK
+        sys.stderr.write(one_line(f"{error.filename or 'standard output'}: {error.strerror}"))
         return WRONG_INPUT
     except (RuntimeError, AssertionError):
         if (text := _backend_error()) is None:
@@ -82,25 +87,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def one_line(message: str) -> str:
     """``message`` on one line, with the name of the command in front."""
     return f"drivetrain: {' '.join(message.split())}\n"
-
-
-def _say(text: str) -> None:
-    """Print ``text`` on standard output; if that fails (a full disk), raise :class:`InputError`."""
-    encoding = sys.stdout.encoding or "utf-8"
-    try:
-        # The encoding of a terminal may lack characters of a title.
-        sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding))
-        sys.stdout.flush()
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        _drop_output()
-        raise InputError(f"standard output: {error.strerror}; allowed is one that can be written") from None
-
-
-def _drop_output() -> None:
-    """Discard buffered output; otherwise Python would try to write it again at exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _backend_error() -> str | None:
@@ -314,12 +300,12 @@ def list_systems(options: argparse.Namespace) -> int:
     """Print all systems, or one system in detail."""
     from drivetrain_jax.runs.catalogue import describe, overview
 
-    _say(describe(options.system) if options.system else overview())
+    print(describe(options.system) if options.system else overview(), end="", flush=True)
     return OK
 
 
 def _answer(reply: Any, options: argparse.Namespace) -> int:
-    _say((reply.to_json() if options.json else str(reply)) + "\n")
+    print(reply.to_json() if options.json else reply, flush=True)
     return OK
 
 
@@ -616,27 +602,20 @@ def progress_line() -> Iterator[Callable[[Progress], None]]:
             bar.stop()
 
 
-def _reading(*files: Path) -> ExitStack:
-    """A context that shows a moving sign, these files and the time on a terminal, and removes them at the end."""
-    stack = ExitStack()
-    if not sys.stderr.isatty():
-        return stack
-    from rich.console import Console
-    from rich.progress import Progress as Bar
-    from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    console = Console(stderr=True)
-    if not console.is_interactive:
-        return stack
-    # Ctrl-C ends the process at once, and nothing would show a hidden cursor again.
-    console.show_cursor = lambda show=True: False
-    columns = SpinnerColumn("line"), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
-    # Answers must go to standard output even while the sign is shown.
-    bar = Bar(*columns, console=console, transient=True, redirect_stdout=False, redirect_stderr=False)
-    first, *more = [file.name for file in files]
-    bar.add_task(f"{first} and {len(more)} more" if more else first, total=None)
-    stack.enter_context(bar)
-    return stack
+@contextmanager
+def _reading(*files: Path) -> Iterator[None]:
+    """Show on a terminal that the command works on these files, and remove the line at the end."""
+    terminal = sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
+    if terminal:
+        more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+        sys.stderr.write(f"{files[0].name}{more} ...\r")
+        sys.stderr.flush()
+    try:
+        yield
+    finally:
+        if terminal:
+            # Clear the line.
+            sys.stderr.write("\x1b[K")
 
 
 if __name__ == "__main__":

@@ -657,7 +657,7 @@ def test_a_run_writes_its_file_without_tables(folder, scene):
             (
                 ">/dev/full",
                 2,
-                "drivetrain: standard output: No space left on device; allowed is one that can be written\n",
+                "drivetrain: standard output: No space left on device\n",
             ),
             (">&-", 0, ""),
         ],
