@@ -1,4 +1,4 @@
-"""Rules for the numbers of a result, each a function of the Dataset alone, and the rules of every analysis.
+"""Rules for the numbers of a result, each a function of the Dataset alone; and what is known of every analysis without jax.
 
 NaN obeys every rule.
 """
@@ -89,16 +89,26 @@ def _differ(one: xr.DataArray, other: xr.DataArray) -> xr.DataArray:
 
 @dataclass(frozen=True)
 class Declared:
-    """``rules`` of an analysis. ``gaps``: variables that may be NaN after a success; ``kept``: variables that may have a
-    value after a failure.
+    """What is known of an analysis without jax: the rules of its results, and how figures draw them."""
 
-    ``has_points`` is false for a function of the parameters, which has no outcomes.
-    """
-
+    #: Rules of the results.
     rules: tuple[Rule, ...] = ()
+    #: Variables that may be NaN after a success.
     gaps: tuple[str, ...] = ()
+    #: Variables that may have a value after a failure.
     kept: tuple[str, ...] = ()
+    #: False for a function of the parameters, which has no outcomes.
     has_points: bool = True
+    #: Variables of each panel of lines; default: a panel for every result.
+    panels: tuple[tuple[str, ...], ...] = ()
+    #: Variables of maps; default: those of the panels.
+    fields: tuple[str, ...] = ()
+    #: Variables whose lines have a logarithmic scale.
+    logarithmic: tuple[str, ...] = ()
+    #: Predicted resonances in figures: ``all``, only those that the forcing excites (``forced``), or none.
+    predicted: str = ""
+    #: Results by several methods may share a figure.
+    overlaid: bool = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.rules, tuple) or not all(isinstance(rule, Rule) for rule in self.rules):
@@ -178,7 +188,7 @@ def _sum_rule(ds: xr.Dataset) -> xr.DataArray:
     return (abs(ds["sum_rule_residual"]) > allowed) & (ds["outcome"] == 0)
 
 
-# Rules of the analyses of this package by name.
+# The analyses of this package by name.
 BUILT_IN = {
     "atlas": Declared(
         (in_order("lower", "upper"), in_order("panel_lower", "panel_upper"), within("panel_degrees", 1.0)),
@@ -205,10 +215,20 @@ BUILT_IN = {
             within("spectral_radius", 0.0),
         ),
         gaps=("floquet_multiplier", "floquet_multiplier_error", "floquet_exponent"),
+        panels=(("spectral_radius",),),
+        fields=("verdict", "spectral_radius"),
+        predicted="all",
     ),
     "forced": Declared(
-        (within("amplitude", 0.0), within("condition", 1.0), within("orbit_amplitude", 0.0)), kept=("condition",)
+        (within("amplitude", 0.0), within("condition", 1.0), within("orbit_amplitude", 0.0)),
+        kept=("condition",),
+        panels=(("amplitude", "orbit_amplitude"), ("orbit_spectral_radius",), ("condition",)),
+        logarithmic=("amplitude", "orbit_amplitude", "condition"),
+        predicted="forced",
     ),
+    "history": Declared(),
+    "parameters": Declared(),
+    "harmonic_response": Declared(),
     "steady_state": Declared(
         (
             *MOTION,
@@ -219,6 +239,7 @@ BUILT_IN = {
         # NaN is allowed: a motion that never repeats has no multipliers, a motion at rest has no phase, and a spectral
         # radius that underflows has no exponent.
         gaps=("phase", "spectral_radius", "floquet_multiplier", "lyapunov_exponent", "state_error"),
+        predicted="all",
     ),
     "frequency_response": Declared(
         (
@@ -252,6 +273,8 @@ BUILT_IN = {
             "state_error",
         ),
         kept=("fit_range",),
+        predicted="forced",
+        overlaid=True,
     ),
     "basins": Declared(
         (

@@ -15,6 +15,7 @@ import xarray as xr
 
 from drivetrain_jax import view
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._rules import BUILT_IN as declared
 from drivetrain_jax._wording import shown
 from drivetrain_jax.resonances import BUILT_IN, Resonances
 from drivetrain_jax.view.style import is_joined, parameters, scene_key
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
 
     Result = xr.Dataset | str | Path
 
-# Analyses whose figures show predicted resonances.
-_PREDICTED = ("floquet", "forced", "frequency_response", "steady_state")
 LABELS = "resonance"
 # Default number of cells along each axis in the chart of an atlas.
 CELLS = 800
@@ -201,7 +200,8 @@ def in_physical_data(dataset: xr.Dataset, asked: Sequence[str]) -> xr.Dataset:
 
 def _with_resonances(dataset: xr.Dataset) -> xr.Dataset:
     """``dataset`` with the predicted resonances of its system, which older files already contain."""
-    if dataset.attrs.get("analysis") not in _PREDICTED or LABELS in dataset.coords:
+    analysis = declared.get(str(dataset.attrs.get("analysis")))
+    if analysis is None or not analysis.predicted or LABELS in dataset.coords:
         return dataset
     found = resonances(dataset)
     return dataset if found is None else dataset.assign_coords({found.name: found})

@@ -13,18 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._plugins import FIGURES, call_plugin, load_plugin, plugin_names
+from drivetrain_jax._rules import BUILT_IN, Declared
 
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
-
-# Analyses of this package, but for the atlas, which is drawn as a chart, and those with a figure of their own.
-_ANALYSES, _DRAWN = (
-    tuple(sorted({path.parent.name for path in Path(__file__).parents[1].glob(f"analysis/*/{file}.py")} - {"atlas"}))
-    for file in ("analysis", "figure")
-)
-# Analyses whose results may share a figure.
-_OVERLAYS = ("frequency_response",)
 
 __all__ = ["plot"]
 
@@ -41,9 +34,11 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     if analysis == "atlas":
         drawn = "what its `grid` and `drivetrain plot` make of it"
         raise InputError(f"analysis = 'atlas': is a function; allowed is {drawn}")
-    plugin = None if analysis in _ANALYSES else _plugin(analysis)
-    if others and plugin is None and analysis not in _OVERLAYS:
-        raise InputError(f"analysis = {analysis!r}: several results in one figure; allowed for {', '.join(_OVERLAYS)}")
+    plugin = None if analysis in BUILT_IN else _plugin(analysis)
+    record = BUILT_IN.get(analysis, Declared())
+    if others and plugin is None and not record.overlaid:
+        allowed = ", ".join(name for name, other in BUILT_IN.items() if other.overlaid)
+        raise InputError(f"analysis = {analysis!r}: several results in one figure; allowed for {allowed}")
     for other in others:
         if other.attrs.get("analysis") != analysis:
             raise InputError(
@@ -56,16 +51,16 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     if plugin is not None:
         allowed = "a matplotlib Figure"
         return call_plugin(FIGURES, analysis, "figure", plugin, dataset, *others, kind=Figure, allowed=allowed)
-    if analysis not in _ANALYSES and "outcome" not in dataset:
-        known = ", ".join((*_ANALYSES, *plugin_names(FIGURES)))
+    if analysis not in BUILT_IN and "outcome" not in dataset:
+        known = ", ".join((*sorted({*BUILT_IN} - {"atlas"}), *plugin_names(FIGURES)))
         raise InputError(f"analysis = {analysis!r}: has no figure; allowed is one of {known}")
 
-    from drivetrain_jax.view.charts import LOOKS, chart, prepare
+    from drivetrain_jax.view.charts import chart, prepare
     from drivetrain_jax.view.style import STYLE
 
     with rc_context(STYLE):
-        if analysis not in _DRAWN:
-            return chart(prepare(dataset), **LOOKS.get(analysis, {}))
+        if not Path(__file__).parents[1].joinpath("analysis", analysis, "figure.py").exists():
+            return chart(prepare(dataset), record.panels, record.fields, logarithmic=record.logarithmic)
         module = import_module(f"drivetrain_jax.analysis.{analysis}.figure")
         return module.plot(*map(prepare, (dataset, *others)))
 

@@ -65,16 +65,6 @@ _WIDE = 3.0
 _DASHES, _FEW = ("-", (0, (4, 1.5)), ":"), 12
 # Variables with a band of error: the stored error and its factor.
 _BANDS = {"lyapunov_spectrum": ("lyapunov_standard_error", 3.0), "basin_fraction": ("basin_error", 1.0)}
-_AMPLITUDES = ("amplitude", "orbit_amplitude")
-# Panels of lines, fields of maps, and options of lines, by analysis; those of others are all results.
-LOOKS: dict[str, dict[str, Any]] = {
-    "floquet": {"panels": [["spectral_radius"]], "fields": ["verdict", "spectral_radius"]},
-    "forced": {
-        "panels": [_AMPLITUDES, ["orbit_spectral_radius"], ["condition"]],
-        "logarithmic": (*_AMPLITUDES, "condition"),
-    },
-    "parameters": {"colours": LINE_COLOURS[:1]},
-}
 # Position between largest decay (-1), none (0) and largest growth (1), and colour; lightness falls monotonically. White is
 # reserved for cells without a value.
 _GROWTH_COLOURS = (

@@ -16,11 +16,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
+from drivetrain_jax._rules import BUILT_IN, Declared
 from drivetrain_jax.view.sheet import write_names
 from drivetrain_jax.view.style import FLAG_COLOURS, FRAME_GREY, PREDICTION
 
-# Analyses of forced responses.
-_FORCED = ("forced", "frequency_response")
 _FAMILY_DASHES = {"solid": "-", "dashed": (0, (5, 2)), "dashdot": (0, (5, 1.5, 1, 1.5))}
 _MARK = {"marker": "o", "markersize": 3.0, "markerfacecolor": "white", "markeredgewidth": 0.7, "linestyle": "none"}
 # Type size of the name of a tip, its width and height, and its distance from the tip, in points.
@@ -50,11 +49,11 @@ def predictions(dataset: xr.Dataset, horizontal: str, vertical: str | None = Non
     name = f"resonance_{horizontal}"
     if name not in dataset.coords:
         return []
-    lines, forced = [], dataset.attrs.get("analysis") in _FORCED
+    lines, shown = [], BUILT_IN.get(str(dataset.attrs.get("analysis")), Declared()).predicted
     families = json.loads(dataset.attrs.get("resonance_families", "{}"))
     for index, label in enumerate(dataset["resonance"].values.astype(str)):
         family = _family(label, families)
-        if not family.get("drawn", True) or (forced and not family.get("forced")):
+        if not family.get("drawn", True) or (shown == "forced" and not family.get("forced")):
             continue
         values = dataset[name].isel(resonance=index)
         y = dataset[vertical].values if vertical is not None and vertical in values.dims else None
