@@ -80,6 +80,12 @@ def test_import_is_light(module):
     assert python(f"import sys, {module}; print(sorted(set({HEAVY}) & set(sys.modules)))") == "[]"
 
 
+@pytest.mark.parametrize("module", ["_rules", "invariants", "view.charts"])
+def test_a_module_that_imports_xarray_may_be_the_first(module):
+    """The first import of xarray registers the accessor, which imports modules of figures."""
+    assert python(f"import drivetrain_jax.{module}, xarray; print(hasattr(xarray.Dataset, 'drivetrain'))") == "True"
+
+
 def scenes() -> dict[tuple[str, str], dict]:
     """The first scene of ``sweeps/`` for every analysis of every system of the package, with its default results."""
     found: dict[tuple[str, str], dict] = {}

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._plugins import FIGURES, call_plugin, load_plugin, plugin_names
-from drivetrain_jax._rules import BUILT_IN, Declared
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -30,6 +29,9 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     ``figure.savefig(path)``. Raises :class:`InputError` for a dataset that is no result, for a result without values to
     plot, and for results that cannot share a figure.
     """
+    # Local import: the rules import xarray, whose first import comes back here for the accessor.
+    from drivetrain_jax._rules import BUILT_IN, Declared
+
     analysis = str(dataset.attrs.get("analysis"))
     if analysis == "atlas":
         drawn = "what its `grid` and `drivetrain plot` make of it"

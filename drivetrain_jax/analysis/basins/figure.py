@@ -52,21 +52,24 @@ def plot(dataset: xr.Dataset) -> Figure:
 def _followed(x: np.ndarray, size: np.ndarray, exists: np.ndarray, multiple: np.ndarray) -> np.ndarray:
     """Branch numbers of attractors ``(values of the axis, attractors)``, -1 for none.
 
-    Results are ordered by size, so the number of an attractor changes where a larger one appears. A branch is extrapolated
-    from its last two sizes to the nearest attractor of its period multiple. A branch ends after two misses.
+    Results are ordered by size, so the number of an attractor changes where a larger one appears. A branch goes on with the
+    attractor of its period multiple that is nearest to its last size, or to the straight line through the last two: this
+    overshoots near a peak. A branch ends after two misses.
     """
     branch, followed = np.full(size.shape, -1), []
     # All non-periodic motions are one attractor, which has no size.
     size = np.where(np.isfinite(size), size, np.inf)
     for i, row in enumerate(size):
-        here = np.flatnonzero(exists[i])
-        gaps = {}
+        here, gaps = np.flatnonzero(exists[i]), []
         for b, places in enumerate(followed):
-            last, k = places[-1]
-            if i - last <= _LOST:
-                likely = (size[last, k], _ahead(x, size, places, i))
-                gaps |= {(j, b): _gap(row[j], likely) for j in here if multiple[i, j] == multiple[last, k]}  # pyright: ignore[reportArgumentType]
-        for (k, b), gap in sorted(gaps.items(), key=lambda item: item[1]):
+            rows, _ = recent = tuple(np.array(places[-2:]).T)
+            likely = size[recent]
+            if np.isfinite(likely).all():
+                line = np.polynomial.Polynomial.fit(x[rows], likely, len(rows) - 1)
+                likely = np.append(likely[-1], line(x[i]))
+            alike = [k for k in here if multiple[i, k] == multiple[places[-1]] and i - rows[-1] <= _LOST]
+            gaps += [(_gap(row[k], likely), k, b) for k in alike]
+        for gap, k, b in sorted(gaps):
             if branch[i, k] < 0 and b not in branch[i] and gap <= _NEAR:
                 branch[i, k] = b
                 followed[b].append((i, k))
@@ -76,20 +79,8 @@ def _followed(x: np.ndarray, size: np.ndarray, exists: np.ndarray, multiple: np.
     return branch
 
 
-def _ahead(x: np.ndarray, size: np.ndarray, places: list[tuple[int, int]], i: int) -> float:
-    """The size at ``x[i]`` on the straight line through the last two of ``places`` in ``size``, NaN without one."""
-    if len(places) < 2:
-        return np.nan
-    (before, _), (last, _) = places[-2:]
-    first, second = (size[place] for place in places[-2:])
-    return second + (second - first) * (x[i] - x[last]) / (x[last] - x[before]) if np.isfinite(second) else np.nan
-
-
-def _gap(size: float, likely: tuple[float, float]) -> float:
-    """Relative difference of ``size`` from the nearer of the ``likely`` sizes; 0 if neither attractor has a size.
-
-    Both sizes count, because the straight line overshoots near a peak.
-    """
+def _gap(size: float, likely: np.ndarray) -> float:
+    """Relative difference of ``size`` from the nearest of the ``likely`` sizes; 0 if the attractor has no size on either."""
     if not np.isfinite(size):
-        return 0.0 if size == likely[0] else np.inf
-    return float(np.nanmin(np.abs(size - np.array(likely)))) / max(abs(size), _REST)
+        return 0.0 if size == likely[-1] else np.inf
+    return float(np.abs(size - likely).min()) / max(abs(size), _REST)
