@@ -707,7 +707,9 @@ def interference(dataset: xr.Dataset, orders: Orders, colours: Sequence[str], ki
         met = met[met[:, 0] <= high]
         axes.plot(*met.T, "o", markersize=3.5, color="black", markerfacecolor="white")
         if k == 0 or operating or shown.size <= _FEW_MODES:
-            sheet.later(partial(write_names, axes, met, [f"{speed:.0f}" for speed in met[:, 0]], offset=4.0, **_NUMBER))
+            # One number for modes of the same frequency.
+            numbers = {f"{speed:.0f}": (speed, height) for speed, height in met}
+            sheet.later(partial(write_names, axes, list(numbers.values()), list(numbers), offset=4.0, **_NUMBER))
     if operating:
         sheet.add(axes.axvspan(*operating, color=LINE_COLOURS[1], alpha=0.2, zorder=0, label="operating speeds"))
     sheet.label(f"speed of the {orders.shaft} [rpm]", "natural frequency [Hz] (number of the mode at the right)")

@@ -109,8 +109,12 @@ class Sheet:
         title = textwrap.wrap(shown_title(dataset), _TITLE_LETTERS, break_on_hyphens=False)
         head = caption_lines("; ".join(part for part in (caption(dataset), note) if part))
         entries = list(self._entries.values())
-        length = sum(_ENTRY + _LETTER * len(_plain(label)) for label in self._entries)
-        lines = math.ceil(length / WIDTH)
+        widths = [_ENTRY + _LETTER * len(_plain(label)) for label in self._entries]
+        # The most columns that have room; matplotlib fills one after the other.
+        counts = range(len(widths), 0, -1)
+        fitting = (n for n in counts if n == 1 or sum(map(max, np.array_split(widths, n))) <= WIDTH)
+        columns = next(fitting, 1)
+        lines = math.ceil(len(widths) / columns)
         top = _TITLE * len(title) + 0.08
         height = rows * self._height + self._more + top + _CAPTION * len(head) + _FOOT + _LEGEND * lines
         figure.set_figheight(height)
@@ -121,7 +125,6 @@ class Sheet:
             figure.suptitle(text, x=_LEFT, ha="left", size=10.5, weight="bold", parse_math=False)
         figure.text(_LEFT, 1 - top / height, "\n".join(head), va="top", size=8, color=FRAME_GREY)
         if entries:
-            columns = math.ceil(len(entries) / lines)
             figure.legend(handles=entries, loc="outside lower left", ncols=columns, columnspacing=1.4, borderpad=0.0)
         figure.align_ylabels()
         for write in self._late:
