@@ -560,17 +560,22 @@ def stack(
     labels = [
         draw_lines(sheet, axes, dataset, along, keys, **look) for (axes,), keys in zip(sheet.axes, panels, strict=True)
     ]
-    fit_axis(sheet.axes[0, 0], "x", dataset[along].values)
     sheet.label(axis_label(dataset[along]), *labels)
-    lines = overlays.predictions(dataset, along)
-    for (axes,) in sheet.axes:
-        sheet.add(*overlays.draw_predictions(axes, lines))
-    sheet.later(partial(overlays.label_predictions, sheet.axes[0, 0], lines))
+    fit_panels(sheet, dataset, along)
     if along in dataset["outcome"].dims:
         codes = valid(dataset, name) if (name := _flagged(dataset)) else computed(dataset)
         for (axes,) in sheet.axes if codes.ndim == 1 and codes.any() else ():
             sheet.add(*draw_flags(axes, codes, along))
     return sheet
+
+
+def fit_panels(sheet: Sheet, dataset: xr.Dataset, along: str) -> None:
+    """Fit the horizontal axes to the values of ``along``, and draw its predicted resonances."""
+    fit_axis(sheet.axes[0, 0], "x", dataset[along].values)
+    lines = overlays.predictions(dataset, along)
+    for (axes,) in sheet.axes:
+        sheet.add(*overlays.draw_predictions(axes, lines))
+    sheet.later(partial(overlays.label_predictions, sheet.axes[0, 0], lines))
 
 
 def draw_lines(

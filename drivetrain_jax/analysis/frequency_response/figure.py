@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.view import charts, overlays
+from drivetrain_jax.view import charts
 from drivetrain_jax.view.sheet import Sheet, fit_axis
 from drivetrain_jax.view.style import (
     FAILED_COLOUR,
@@ -122,18 +123,17 @@ def _lines(results: list[xr.Dataset], path: str) -> Figure:
         _, colour, width = _METHODS[_method(result)]
         line: dict[str, Any] = {"color": colour, "linewidth": width}
         if {"branch_u_max", "branch_u_min", "branch_stability"} <= set(result):
-            _draw_saddles(sheet, upper, result, path, line)
+            sheet.add(*_draw_saddles(upper, result, path, line))
         for direction, mark in _DIRECTIONS.items():
             sweep = result.sel(sweep_direction=direction)
             exact = {"marker": mark, **_MARK_STYLE} if _method(result) == "exact" else {}
             label = f"exact, {direction}" if exact else _label(result)
             sheet.add(Line2D([], [], **line, **exact, label=label))
-            jumps = _jumps(_amplitude(sweep).values)
-            _draw_sweep(sheet, upper, sweep, _amplitude(sweep).values, jumps, path, line, exact)
+            sheet.add(*_draw_sweep(upper, sweep, _amplitude(sweep).values, line, exact))
             for axes in lower:
                 # The phase [rad] modulo a turn; small negative values from rounding stay.
                 lags.append((value_in(sweep["phase"], "rad") + _ROUNDING) % (2 * np.pi) - _ROUNDING)
-                _draw_sweep(sheet, axes, sweep, lags[-1], jumps, path, line, exact)
+                sheet.add(*_draw_sweep(axes, sweep, lags[-1], line, exact))
     # The margin of matplotlib is a share of the range, which is small for a flat curve.
     upper.set_ylim(0, 1.03 * upper.get_ylim()[1])
     for result in results:
@@ -188,40 +188,35 @@ def _jumps(y: np.ndarray) -> np.ndarray:
 
 
 def _draw_sweep(
-    sheet: Sheet,
-    axes: Axes,
-    sweep: xr.Dataset,
-    y: np.ndarray,
-    jumps: np.ndarray,
-    path: str,
-    line: dict[str, Any],
-    mark: dict[str, Any],
-) -> None:
-    """Draw a sweep: stable pieces solid, unstable ones dashed, jumps dotted; with markers for an exact one."""
+    axes: Axes, sweep: xr.Dataset, y: np.ndarray, line: dict[str, Any], mark: dict[str, Any]
+) -> Iterator[Line2D]:
+    """Draw a sweep: stable pieces solid, unstable ones dashed, jumps dotted; with markers for an exact one; yields legend
+    entries."""
+    path, jumps = charts.role(sweep, "speed"), np.flatnonzero(_jumps(_amplitude(sweep).values))
     x, wandering = sweep[path].values.astype(float), _wandering(sweep).values
     unstable = (sweep["stability"].values == _UNSTABLE) & ~wandering if "stability" in sweep else wandering & False
-    y, gaps = np.where(wandering, np.nan, y), np.flatnonzero(jumps) + 1
-    broken = np.insert(x, gaps, np.nan)
+    y, broken = np.where(wandering, np.nan, y), np.insert(x, jumps + 1, np.nan)
     for kind, style in ((~unstable, _SOLID), (unstable, _DASHED)):
         # One point more at either end, so that pieces of different kind meet.
         kind = kind | np.append(kind[1:], False)
-        piece = np.insert(np.where(kind | np.append(False, kind[:-1]), y, np.nan), gaps, np.nan)
+        piece = np.insert(np.where(kind | np.append(False, kind[:-1]), y, np.nan), jumps + 1, np.nan)
         axes.plot(broken, piece, **line, **style)
         if style is _DASHED and kind.any():
             # A pale line below the dashes: a short unstable piece would look like a gap.
             axes.plot(broken, piece, **line, alpha=0.3, zorder=1.5)
-            sheet.add(_UNSTABLE_ENTRY)
-    for i in np.flatnonzero(jumps):
+            yield _UNSTABLE_ENTRY
+    for i in jumps:
         axes.plot(x[i : i + 2], y[i : i + 2], **(line | _JUMPED))
-        sheet.add(_JUMP_ENTRY)
+        yield _JUMP_ENTRY
     if mark:
         every = max(len(x) // _MOST_MARKS, 1)
         shown = slice(every // 2 if mark["marker"] == _DIRECTIONS["down"] else 0, None, every)
         axes.plot(x[shown], y[shown], linestyle="", **mark)
 
 
-def _draw_saddles(sheet: Sheet, axes: Axes, result: xr.Dataset, path: str, line: dict[str, Any]) -> None:
-    """Draw unstable motions off the sweeps as dashed lines, one for each branch number, to the stable ones they meet."""
+def _draw_saddles(axes: Axes, result: xr.Dataset, path: str, line: dict[str, Any]) -> Iterator[Line2D]:
+    """Draw unstable motions off the sweeps as dashed lines, one for each branch number, to the stable ones they meet; yields
+    their legend entry."""
     x, amplitude = result[path].values, _amplitude(result, "branch_").transpose(path, "branch").values
     unstable = result["branch_stability"].transpose(path, "branch").values == _UNSTABLE
     stable, saddles = np.where(unstable, np.nan, amplitude), np.where(unstable, amplitude, np.nan)
@@ -234,7 +229,7 @@ def _draw_saddles(sheet: Sheet, axes: Axes, result: xr.Dataset, path: str, line:
                 met.append(stable[end, distance.argmin()] if distance.min() < near else y[end])
             places, values = x[piece], y[piece]
             axes.plot([places[0], *places, places[-1]], [met[0], *values, met[1]], **line, **_DASHED)
-            sheet.add(_UNSTABLE_ENTRY)
+            yield _UNSTABLE_ENTRY
 
 
 def _draw_special(sheet: Sheet, axes: Axes, result: xr.Dataset, path: str) -> None:
@@ -278,7 +273,6 @@ def _orbits(dataset: xr.Dataset, path: str) -> Figure:
     amplitude, x = dataset["branch_amplitude"], dataset[path].values
     (own,) = (str(dim) for dim in amplitude.dims if dim not in (path, "branch"))
     sheet = Sheet(amplitude.sizes[own], height=2.6, sharey=False)
-    lines = overlays.predictions(dataset, path)
     stability = dataset["branch_stability"].transpose(path, "branch").values
     for (axes,), name, colour in zip(sheet.axes, amplitude[own].values.tolist(), LINE_COLOURS, strict=False):
         values = amplitude.sel({own: name}).transpose(path, "branch").values
@@ -289,8 +283,6 @@ def _orbits(dataset: xr.Dataset, path: str) -> Figure:
             sheet.add(*(axes.plot(x[place], values[place, branch], "o", **style, label=label) if place.size else ()))
         _draw_bifurcations(sheet, axes, dataset)
         axes.set_ylim(bottom=0.0)
-        sheet.add(*overlays.draw_predictions(axes, lines))
-    fit_axis(sheet.axes[0, 0], "x", x)
+    charts.fit_panels(sheet, dataset, path)
     sheet.label(axis_label(dataset[path]), variable_label(amplitude))
-    sheet.later(lambda: overlays.label_predictions(sheet.axes[0, 0], lines))
     return sheet.finish(dataset)
