@@ -607,8 +607,8 @@ def _reading(*files: Path) -> Iterator[None]:
     """Show on a terminal that the command works on these files, and remove the line at the end."""
     terminal = sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
     if terminal:
-        more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-        sys.stderr.write(f"{files[0].name}{more} ...\r")
+        first, *more = [file.name for file in files]
+        sys.stderr.write(f"{first}{f' and {len(more)} more' if more else ''} ...\r")
         sys.stderr.flush()
     try:
         yield

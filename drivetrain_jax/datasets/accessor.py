@@ -13,8 +13,6 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.store.consolidate import open_result
-from drivetrain_jax.store.files import move_into_place
 from drivetrain_jax.view.style import scene_key
 
 if TYPE_CHECKING:
@@ -230,6 +228,9 @@ def write_csv(source: Path, out: Path) -> int:
 
     Raises: :class:`~drivetrain_jax.InputError` for an atlas, which is a function.
     """
+    from drivetrain_jax.store.consolidate import open_result
+    from drivetrain_jax.store.files import move_into_place
+
     dataset = open_result(source)
     if dataset.attrs.get("analysis") == "atlas" or "outcome" not in dataset:
         raise InputError(

@@ -226,8 +226,7 @@ def _about_orders(dataset: xr.Dataset) -> Iterator[str]:
 def _place(dataset: xr.Dataset, variable: xr.DataArray, place: tuple[Any, ...]) -> str:
     """``name = value unit`` for every swept parameter at one place of ``variable``."""
     return ", ".join(
-        f"{name} = {value}{'' if units in ('1', '') else f' {units}'}"
-        for name, value, units in coordinates(dataset, variable, place)
+        f"{name} = {value} {units}".removesuffix(" 1") for name, value, units in coordinates(dataset, variable, place)
     )
 
 
@@ -315,15 +314,9 @@ def coordinates(dataset: xr.Dataset, variable: xr.DataArray, place: tuple[Any, .
     for dim, k in zip(variable.dims, place, strict=True):
         columns = [c for c in dataset.coords.values() if c.dims == (dim,) and dim == "point" and c.name != "point"]
         for axis in columns or ([dataset[dim]] if dim in dataset.coords else []):
-            value = axis.values[k]
-            text = str(value) if axis.dtype.kind in "UO" else digits(value)
-            found.append(
-                (
-                    scene_key(axis).replace("_", " ") if axis.dtype.kind in "UO" else scene_key(axis),
-                    text,
-                    units_of(axis),
-                )
-            )
+            words = axis.dtype.kind in "UO"
+            name = scene_key(axis).replace("_", " ") if words else scene_key(axis)
+            found.append((name, str(axis.values[k]) if words else digits(axis.values[k]), units_of(axis)))
     return found
 
 
