@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from drivetrain_jax.runs.run import Incomplete, Interrupted, run
     from drivetrain_jax.systems.bicardan import Bicardan
     from drivetrain_jax.systems.cardan import Cardan
+    from drivetrain_jax.systems.driveline import Driveline
     from drivetrain_jax.systems.planetary import Planetary
     from drivetrain_jax.systems.rattle import Rattle
     from drivetrain_jax.systems.tripod import Tripod
@@ -54,6 +55,7 @@ _HOME = {
     "runs.run": ("Incomplete", "Interrupted", "run"),
     "systems.bicardan": ("Bicardan",),
     "systems.cardan": ("Cardan",),
+    "systems.driveline": ("Driveline",),
     "systems.planetary": ("Planetary",),
     "systems.rattle": ("Rattle",),
     "systems.tripod": ("Tripod",),
@@ -65,6 +67,7 @@ __all__ = [
     "Bicardan",
     "Cardan",
     "ChunkError",
+    "Driveline",
     "Incomplete",
     "InputError",
     "Interrupted",

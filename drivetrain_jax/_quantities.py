@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from dataclasses import dataclass
 from decimal import Decimal
@@ -12,6 +13,7 @@ from typing import Any
 from drivetrain_jax import _units
 from drivetrain_jax._wording import shown
 
+_QUOTIENT = re.compile(r"\s*([+-]?\d{1,9})\s*/\s*([1-9]\d{0,8})\s*")
 # First code of ``outcome`` without a value.
 FIRST_FAILURE = 2
 
@@ -56,6 +58,8 @@ class Parameter:
     usual: float = math.inf
     #: 0 is allowed below ``lower``.
     or_zero: bool = False
+    #: A quotient of integers is allowed: ``"41/11"``, the teeth of two gears.
+    fraction: bool = False
 
     @property
     def is_number(self) -> bool:
@@ -108,6 +112,8 @@ class Parameter:
 
     def _check_number(self, value: object, label: str) -> float | int:
         written = isinstance(value, str)
+        if isinstance(value, str) and self.fraction and (quotient := _QUOTIENT.fullmatch(value)):
+            value = int(quotient[1]) / int(quotient[2])
         if isinstance(value, str):
             value = self._in_units(value, label)
         elif isinstance(value, Decimal) or (isinstance(value, Real) and not isinstance(value, (bool, int, float))):

@@ -152,6 +152,7 @@ BUILT_IN: dict[str, Resonances | None] = {
     "tripod": None,
     "planetary": None,
     "bicardan": None,
+    "driveline": None,
 }
 
 

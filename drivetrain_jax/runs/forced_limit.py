@@ -60,13 +60,14 @@ class Limit:
         known, unstable, undecided = bool(np.all(np.isfinite(amplitudes))), verdict == 1, verdict == 2
         above = known and bool(np.max(amplitudes) > self.value)
         within = None if not known or (undecided and not above) else not (above or unstable)
-        each = ", ".join(f"{name} {self.written(a)}" for name, a in zip(self.names, amplitudes, strict=True))
+        names = self.names or tuple(map(str, range(1, len(amplitudes) + 1)))
+        each = ", ".join(f"{name} {self.written(a)}" for name, a in zip(names, amplitudes, strict=True))
         compared = "unstable: the motion grows beyond" if unstable else "above" if above else "within"
         doubt = " if the motion is stable, which is undecided" if within is None else ""
         values = [float(a) if np.isfinite(a) else None for a in amplitudes]
         text = f"{each}; {compared} the limit of {self.written(self.value)}{doubt}" if known else "no value"
         return text, {
-            "amplitude": dict(zip(self.names, values, strict=True)),
+            "amplitude": dict(zip(names, values, strict=True)),
             "limit": self.value,
             "units": self.own,
             "within": within,

@@ -6,7 +6,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.atlas.analysis import ANALYSIS
-from drivetrain_jax.runs.axes import MAX_RANGES, Grid
+from drivetrain_jax.runs.axes import MAX_RANGES, Grid, entry_of
 from drivetrain_jax.runs.job import Job, mean_cost
 from drivetrain_jax.runs.scene import Ranges, Scene, atlas_ranges
 from drivetrain_jax.runs.work import DIRECT, Route
@@ -58,7 +58,7 @@ def choose_atlas(scene: Scene) -> tuple[Ranges, int | None] | None:
                 f"options.method = 'atlas': axes.{several.shown.name} changes {names} together; allowed are auto and direct"
             )
         return None
-    if whole := next((name for name in ranges if scene.system.parameter(name).integer), ""):
+    if whole := next((name for name in ranges if scene.system.parameter(entry_of(name)[0]).integer), ""):
         if scene.request.method == "atlas":
             raise InputError(f"options.method = 'atlas': {whole} is an integer; allowed are auto and direct")
         return None

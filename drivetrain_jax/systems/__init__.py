@@ -36,6 +36,7 @@ _BUILT_IN = {
     "rattle": "Rattle",
     "planetary": "Planetary",
     "bicardan": "Bicardan",
+    "driveline": "Driveline",
 }
 
 __all__ = [

@@ -296,6 +296,8 @@ class System(eqx.Module):
     roles: ClassVar[Mapping[str, str]] = MappingProxyType({})
     #: Components of the state.
     state: ClassVar[tuple[Component, ...]] = ()
+    #: Dimension of the entries of each component of the state, if their number depends on the parameters.
+    state_axis: ClassVar[Dimension | None] = None
     #: Dimension of the components of the state whose amplitudes ``forced`` reports.
     displacements: ClassVar[Dimension | None] = None
     #: Names of the families of ``modes`` by their codes.

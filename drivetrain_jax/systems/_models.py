@@ -213,8 +213,9 @@ class LinearPeriodic(eqx.Module):
     @property
     def displacement_unit(self) -> Any:
         """u if the system is ``q' = u p, p' = P q + E p`` with a constant u, which its rows show as the numbers 0 and 1."""
-        rows, unit = (self.rows.rows, self.rows.length) if isinstance(self.rows, _Piece) else (self.rows, 1.0)
-        matrix = rows(*self.basis(0.0))
+        piece = self.rows
+        whole, unit = (piece, piece.length) if isinstance(piece, _Piece) else (self, 1.0)
+        matrix = whole.rows(*whole.basis(0.0))
         half = len(matrix) // 2
         upper = [(entry, j == i + half) for i in range(half) for j, entry in enumerate(matrix[i])]
         is_pair = len(matrix) == 2 * half and all(isinstance(x, int | float) and x == one for x, one in upper)
@@ -306,13 +307,14 @@ class ForcedModel(eqx.Module):
 
     ``field(t, y)`` is the nonlinear system ``y' = field(t, y)`` of period ``period`` and ``linear(t, y)`` its
     linearisation about ``y = 0``, forcing included. Both act on states of shape ``(n,)``. ``displacements`` are the
-    indices of the components whose amplitude is reported.
+    indices of the components whose amplitude is reported. ``size`` is n if it depends on the parameters.
     """
 
     field: Callable[[Any, Array], Array]
     linear: Callable[[Any, Array], Array]
     period: Any
     displacements: tuple[int, ...] = eqx.field(static=True)
+    size: int | None = eqx.field(static=True, default=None)
 
 
 Components = tuple[Any, ...]

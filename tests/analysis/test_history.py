@@ -217,7 +217,10 @@ def test_a_system_names_the_components_of_its_state():
 
 def test_a_flow_has_the_components_that_the_system_says():
     system = SimpleNamespace(
-        name="lorenz", models={"history": SimpleNamespace(build=lambda columns: lorenz(1))}, state=Lorenz.state[:2]
+        name="lorenz",
+        models={"history": SimpleNamespace(build=lambda columns: lorenz(1))},
+        state=Lorenz.state[:2],
+        state_axis=None,
     )
     defaults = {option.name: option.default for option in history.ANALYSIS.options}
     request = Request(("phi",), "diffrax", defaults | {"times": (1.0,)})

@@ -271,6 +271,7 @@ def _solve(
     """All requested results of one point; ``effort`` only orders the batches, as every integration is adaptive."""
     del effort
     model, rtol = build(values), request.options["rtol"]
+    n = model.size or n
     response = linear_response(model, n, rtol, not PEAKS.isdisjoint(request.outputs))
     results: dict[str, Any] = {"periodic_state": response.state, "periodic_state_error": response.error}
     results |= {"amplitude": response.amplitude, "amplitude_phase": response.phase}
@@ -300,7 +301,8 @@ def predicted_steps(build: Build, n: int, moving: int, columns: Mapping[str, np.
 def _matrices(build: Build, n: int, moving: int, values: Mapping[str, Any]) -> Array:
     """The period times the Jacobian of the linear field of one point at three phases, ``(3, n, n)``."""
     model = build(values)
-    if len(model.displacements) != moving:
+    n = model.size or n
+    if moving not in (0, len(model.displacements)):
         raise InputError(
             f"system: its model has {len(model.displacements)} displacements; allowed is {moving}, as it says"
         )
@@ -370,7 +372,7 @@ def _displacements(system: type[System]) -> Dimension:
 
 
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
-    names = tuple(c.name for c in system.state)
+    names = () if system.state_axis else tuple(c.name for c in system.state)
     return Dimension("state", "component of the state", names), _displacements(system)
 
 

@@ -50,21 +50,29 @@ def _solve(system: type[System], request: Request, values: Mapping[str, Any], ef
     failed = jnp.where(has_finite_start(flow), Outcome.STEP_LIMIT, Outcome.NOT_FINITE)
     outcome = jnp.where(found.healthy, outcome, failed)
     scale = jnp.stack([jnp.asarray(s, float) for s in flow.scale or (1.0,) * flow.size])
-    results = {c.name: (scale * states)[:, i] for i, c in enumerate(system.state)}
-    results |= {f"{c.name}_error": (scale * error)[:, i] for i, c in enumerate(system.state)}
+    results = _by_component(system, scale * states, "") | _by_component(system, scale * error, "_error")
     return {name: results[name] for name in request.outputs} | {"outcome": outcome.astype(jnp.int8)}
+
+
+def _by_component(system: type[System], values: Array, suffix: str) -> dict[str, Array]:
+    """The components of ``values`` ``(T, n)`` by name, ``(T,)``, or ``(T, m)`` along the axis of the state."""
+    parts = values.reshape(len(values), len(system.state), -1)
+    return {
+        f"{c.name}{suffix}": parts[:, i] if system.state_axis else parts[:, i, 0] for i, c in enumerate(system.state)
+    }
 
 
 def _effort(system: type[System], request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Predicted segments, shape (N,): strobes and requested times; infinite beyond the limit."""
     times = requested_times(request)
-    strobes = times[-1] / predicted(_period, (system.models["history"].build, len(system.state)), columns)
+    size = None if system.state_axis else len(system.state)
+    strobes = times[-1] / predicted(_period, (system.models["history"].build, size), columns)
     return np.where(strobes <= limits_of(request).strobes, np.ceil(strobes) + len(times), np.inf)
 
 
-def _period(build: Callable[..., Flow], size: int, values: Mapping[str, Any]) -> Array:
+def _period(build: Callable[..., Flow], size: int | None, values: Mapping[str, Any]) -> Array:
     flow = build(values)
-    if flow.size != size:
+    if size not in (None, flow.size):
         raise InputError(f"system: its flow has {flow.size} components; allowed is one for each of its state, {size}")
     return jnp.asarray(flow.period)
 
@@ -81,7 +89,8 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
 
 
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
-    return (Dimension("time", "time", requested_times(request), system.unit_of_time()),)
+    time = Dimension("time", "time", requested_times(request), system.unit_of_time())
+    return (time,) if system.state_axis is None else (time, system.state_axis)
 
 
 def _of_system(system: type[System]) -> dict[str, Any]:
@@ -101,9 +110,10 @@ def _of_system(system: type[System]) -> dict[str, Any]:
             "dimensions": piecewise.dimensions,
             "derivatives": piecewise.derivatives,
         }
-    values = tuple(Variable(c.name, c.units, c.long_name, ("time",)) for c in system.state)
+    dims = ("time",) if system.state_axis is None else ("time", system.state_axis.name)
+    values = tuple(Variable(c.name, c.units, c.long_name, dims) for c in system.state)
     errors = tuple(
-        Variable(f"{c.name}_error", c.units, f"estimated absolute error of {c.name}", ("time",)) for c in system.state
+        Variable(f"{c.name}_error", c.units, f"estimated absolute error of {c.name}", dims) for c in system.state
     )
     return {
         "variables": values + errors,

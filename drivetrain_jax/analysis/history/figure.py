@@ -29,6 +29,8 @@ def plot(dataset: xr.Dataset) -> Figure:
     """
     charts.require(dataset, *_components(dataset))
     names = charts.sweep_axes(dataset)
+    # Of a state with an axis of its own, the last entry: the free end of a driveline.
+    dataset = dataset.isel({d: -1 for d in dataset[_components(dataset)[0]].dims if d not in (*names, "time")})
     if not names:
         return _single(dataset)
     if len(names) > 1 or dataset.sizes[names[0]] > _MOST_ROWS:

@@ -1,0 +1,99 @@
+"""A driveline by Lagrange multipliers, in plain NumPy and SciPy; independent of drivetrain_jax.
+
+Coordinates are the rotations a_i of the inertias and the rotations b_i behind the joints, which have no inertia. A joint is
+the constraint that the pins of its two yokes are perpendicular in space: with the unit vectors u(a) of the pin of the input
+yoke and v(b) of that of the output yoke, ``u(a_{i-1} + phase_i) . v(b_i) = 0``. No ratio of speeds is used. The linear
+equations come from complex steps of the torques about the rigid motion, in absolute rotations.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+Chain = Mapping[str, Any]
+_STEP = 1e-30
+
+
+def _pins(beta: float, phase: float, a: Any, b: Any) -> tuple[Any, Any, Any]:
+    """The constraint ``g = u . v`` and its derivatives by a and by b.
+
+    The shafts lie in the plane x, z at the angle beta; the pin of the input yoke turns in the plane x, y, from the normal y
+    of the plane of the shafts, and that of the output yoke across its own shaft, a quarter turn ahead of it at first.
+    """
+    c = math.cos(beta)
+    phi, psi = a + phase, b + phase
+    # u = (-sin phi, cos phi, 0), v = (-cos psi cos beta, -sin psi, cos psi sin beta).
+    g = np.sin(phi) * np.cos(psi) * c - np.cos(phi) * np.sin(psi)
+    ga = np.cos(phi) * np.cos(psi) * c + np.sin(phi) * np.sin(psi)
+    gb = -np.sin(phi) * np.sin(psi) * c - np.cos(phi) * np.cos(psi)
+    return g, ga, gb
+
+
+def _behind(beta: float, phase: float, a: Any) -> Any:
+    """The rotation behind the joint, by Newton's method on the constraint."""
+    b = a
+    for _ in range(60):
+        g, _, gb = _pins(beta, phase, a, b)
+        b = b - g / gb
+        if abs(g) < 1e-17:
+            break
+    return b
+
+
+def torques(chain: Chain, tau: float, a: Any, rate: Any) -> np.ndarray:
+    """Torques on the inertias over speed^2, for absolute rotations ``a`` and their rates by tau."""
+    w, force = chain["speed"], np.zeros(len(chain["k"]), complex)
+    before, turned = tau, 1.0
+    for i in range(len(force)):
+        b = _behind(chain["beta"][i], chain["phase"][i], before)
+        _, ga, gb = _pins(chain["beta"][i], chain["phase"][i], before, b)
+        onward = -ga / gb * turned
+        r = chain["ratio"][i]
+        torque = chain["k"][i] * (a[i] - r * b) / w**2 + chain["c"][i] * (rate[i] - r * onward) / w
+        # The massless part behind the joint is in equilibrium: r torque + multiplier gb = 0.
+        multiplier = -r * torque / gb
+        force[i] -= torque
+        if i:
+            force[i - 1] += multiplier * ga
+        before, turned = a[i], rate[i]
+    return force
+
+
+def rigid(chain: Chain, tau: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations and rates of the rigid chain."""
+    rotations, rates, before, turned = [], [], tau, 1.0
+    for beta, phase, r in zip(chain["beta"], chain["phase"], chain["ratio"], strict=True):
+        b = _behind(beta, phase, before)
+        _, ga, gb = _pins(beta, phase, before, b)
+        before, turned = r * b, -r * ga / gb * turned
+        rotations.append(before)
+        rates.append(turned)
+    return np.array(rotations), np.array(rates)
+
+
+def linear_matrix(chain: Chain, tau: float) -> np.ndarray:
+    """The matrix of ``(x, x')' = A (x, x')`` about the rigid motion."""
+    n, (rotations, rates) = len(chain["k"]), rigid(chain, tau)
+    columns = []
+    for j in range(2 * n):
+        moved = np.zeros(2 * n, complex)
+        moved[j] = 1j * _STEP
+        columns.append(torques(chain, tau, rotations + moved[:n], rates + moved[n:]).imag / _STEP)  # pyright: ignore[reportAttributeAccessIssue]
+    lower = np.transpose(columns) / np.asarray(chain["J"])[:, None]
+    return np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower])
+
+
+def multipliers(chain: Chain, period: float, rtol: float = 1e-11) -> np.ndarray:
+    """Floquet multipliers over ``period``."""
+    n = 2 * len(chain["k"])
+
+    def field(tau: float, y: np.ndarray) -> np.ndarray:
+        return (linear_matrix(chain, tau) @ y.reshape(n, n)).ravel()
+
+    end = solve_ivp(field, (0.0, period), np.eye(n).ravel(), method="DOP853", rtol=rtol, atol=rtol / 100)
+    return np.linalg.eigvals(end.y[:, -1].reshape(n, n))

@@ -1,0 +1,333 @@
+"""Drivelines against references in 80 bits, the cardan shaft, closed forms, and equations with Lagrange multipliers."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import eigh
+
+import drivetrain_jax as dt
+from drivetrain_jax.systems.driveline import MOST_TURNS
+from tests.oracles import driveline_reference as oracle
+from tests.quick_jit import quick_jit
+from tests.sizes import full_after
+
+REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "driveline.json").read_text())
+CASES = {case["name"]: case for case in REFERENCE["cases"]}
+LISTS = ("k", "c", "J", "beta", "phase", "ratio")
+MULTIPLIERS = ["floquet_multiplier", "floquet_multiplier_error"]
+
+
+def of_case(name: str, **changes) -> dt.Driveline:
+    case = CASES[name]
+    ratio = [f"{p}/{q}" for p, q in case["ratio_fraction"]]
+    values: dict[str, Any] = {n: case[n] for n in ("speed", *LISTS)} | {"ratio": ratio} | changes
+    return dt.Driveline(**values)
+
+
+def random_chain(rng, n: int, joints: int, gears: bool = False) -> dict[str, Any]:
+    """Parameters with moderate damping; the first joints bend, and a gear of 3/2 follows the first element."""
+    beta = np.zeros(n)
+    beta[rng.choice(np.arange(1, n), joints, replace=False)] = rng.uniform(0.1, 0.8, joints)
+    return {
+        "speed": float(rng.uniform(8, 20)),
+        "k": rng.uniform(5, 150, n).tolist(),
+        "c": rng.uniform(0.005, 0.1, n).tolist(),
+        "J": rng.uniform(0.05, 0.8, n).tolist(),
+        "beta": beta.tolist(),
+        "phase": rng.uniform(0, math.pi, n).tolist(),
+        "ratio": [1.5 if gears and i == 0 else 1.0 for i in range(n)],
+    }
+
+
+def farthest(found, expected) -> float:
+    """The largest distance of an expected number from the nearest one found."""
+    return max(np.abs(np.asarray(found) - x).min() for x in np.asarray(expected))
+
+
+def multipliers_by_scipy(form) -> np.ndarray:
+    """Multipliers of a linear periodic form, with its reversal if it is half a period."""
+    matrix, n = quick_jit(form.matrix), form.size
+    end = solve_ivp(
+        lambda t, y: (np.asarray(matrix(t)) @ y.reshape(n, n)).ravel(),
+        (0.0, form.span),
+        np.eye(n).ravel(),
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-14,
+    )
+    phi, ends = end.y[:, -1].reshape(n, n), form.ends()
+    return np.linalg.eigvals(phi if ends is None else np.array(ends[0]) @ phi.T @ np.array(ends[1]) @ phi)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_field_linearisation_and_forcing_are_those_of_the_reference(name):
+    case, shaft = CASES[name], of_case(name)
+    n, linear = len(case["k"]), case["linear"]
+    field = quick_jit(shaft.vector_field)(case["field"]["tau"], jnp.array(case["field"]["y"]))
+    np.testing.assert_allclose(field, case["field"]["dy"], rtol=0, atol=1e-12)
+    model = shaft.floquet_model()
+    matrix = np.asarray(quick_jit(model.natural.matrix)(linear["tau"]))
+    np.testing.assert_allclose(matrix[n:, :n], -np.array(linear["P_absolute"]), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(matrix[n:, n:], -np.array(linear["E"]), rtol=0, atol=1e-11)
+    forcing = quick_jit(shaft.linear_field)(linear["tau"], jnp.zeros(2 * n))
+    np.testing.assert_allclose(forcing[n:], linear["f"], rtol=0, atol=1e-12)
+    assert model.natural.span == pytest.approx(math.pi * case["period_over_pi"], rel=1e-15)
+    if model.natural.log_determinant:
+        assert float(model.natural.log_determinant()) == pytest.approx(case["log_det"], abs=1e-13)
+    else:
+        assert set(case["ratio"]) != {1.0}
+
+
+@pytest.mark.parametrize("name", full_after(2, ["ref2", "ref3", "ref1", "ref4", "ref5", "ref6"]))
+def test_multipliers_are_those_of_the_reference(name):
+    found = dt.floquet(of_case(name), outputs=[*MULTIPLIERS, "liouville_residual"], rtol=1e-12)
+    expected = [complex(*z) for z in CASES[name]["multipliers_absolute"]]
+    assert farthest(found.floquet_multiplier, expected) < 1e-11
+    assert farthest(found.floquet_multiplier, expected) <= np.max(found.floquet_multiplier_error)
+    assert abs(found.liouville_residual) < 1e-11
+
+
+def pairs(count: int) -> tuple[list[dt.Driveline], list[dt.Cardan]]:
+    """Random cardan shafts, and the same as drivelines of two inertias."""
+    rng, chains, shafts = np.random.default_rng(5), [], []
+    for _ in range(count):
+        speed, k, j = rng.uniform(3, 30), rng.uniform(5, 100, 2), rng.uniform(0.05, 1, 2)
+        c, beta = rng.uniform(0.001, 0.5, 2), rng.uniform(-1.3, 1.3)
+        chains.append(dt.Driveline(speed=speed, k=k, c=c, J=j, beta=[0.0, beta]))
+        data = {"J1": j[0], "J2": j[1], "k1": k[0], "k2": k[1], "c1": c[0], "c2": c[1]}
+        shafts.append(dt.Cardan.from_physical(**data, speed=speed * 60 / (2 * math.pi), beta=beta))
+    return chains, shafts
+
+
+def batch(systems: list):
+    return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(each, float) for each in x]), *systems)
+
+
+def test_equations_of_one_joint_are_those_of_cardan():
+    chains, shafts = map(batch, pairs(200))
+    rng = np.random.default_rng(6)
+    tau, y = rng.uniform(0, 10, 200), rng.normal(0, 0.5, (200, 4))
+    for name in ("vector_field", "linear_field"):
+        found, expected = (
+            jax.vmap(lambda s, t, y, name=name: getattr(s, name)(t, y))(each, tau, y) for each in (chains, shafts)
+        )
+        np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", full_after(1, [32, 1000]))
+def test_multipliers_of_one_joint_are_those_of_cardan(count):
+    chains, shafts = map(batch, pairs(count))
+    found, expected = (
+        jax.vmap(lambda s: dt.floquet(s, outputs=MULTIPLIERS, rtol=1e-12))(each) for each in (chains, shafts)
+    )
+    distances = [
+        farthest(a, b) / abs(b).max()
+        for a, b in zip(found.floquet_multiplier, expected.floquet_multiplier, strict=True)
+    ]
+    # Multipliers that nearly coalesce move by the root of the error of the matrix, which their bounds say.
+    bounds = np.max(found.floquet_multiplier_error + expected.floquet_multiplier_error, axis=1)
+    assert np.median(distances) < 1e-12
+    assert np.all(np.array(distances) < np.maximum(1e-11, bounds))
+
+
+@pytest.mark.parametrize("n", [1, 2, 7])
+def test_frequencies_of_a_uniform_chain_are_the_closed_form(n):
+    shaft = dt.Driveline(speed=1.0, k=[250.0] * n, c=[0.0] * n, J=[0.4] * n)
+    found = 2 * math.pi * np.asarray(dt.modes(shaft, outputs=["natural_frequency"]).natural_frequency)
+    expected = 2 * math.sqrt(250 / 0.4) * np.sin((2 * np.arange(1, n + 1) - 1) * math.pi / (2 * (2 * n + 1)))
+    np.testing.assert_allclose(found, expected, rtol=1e-13)
+
+
+def test_frequencies_of_a_geared_chain_are_generalised_eigenvalues():
+    shaft = of_case("ref6")
+    found = np.asarray(dt.modes(shaft, outputs=["natural_frequency"]).natural_frequency)
+    n = np.eye(5) - np.diag(CASES["ref6"]["ratio"][1:], -1)
+    squares = eigh(n.T @ np.diag(shaft.k) @ n, np.diag(shaft.J), eigvals_only=True)
+    np.testing.assert_allclose(2 * math.pi * found, np.sqrt(squares), rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "turns"), [((), 0.5), ((1, 1.5, 1, 1), 1.0), ((2, 1, 1, 1), 0.25), ((1, "41/11", 1, 1), 5.5)]
+)
+def test_period_follows_from_the_ratios_before_the_joints(ratio, turns):
+    shaft = dt.Driveline(speed=9.0, k=[9.0] * 4, c=[0.0] * 4, J=[1.0] * 4, beta=[0.0, 0.2, 0.3, 0.0], ratio=ratio)
+    assert isinstance(shaft.half_turns(), float)
+    assert shaft.half_turns() == 2 * turns
+    assert float(jax.jit(lambda s: jnp.asarray(s.half_turns()))(shaft)) == 2 * turns
+
+
+def test_traced_ratios_without_a_common_period_have_none():
+    shaft = dt.Driveline(speed=9.0, k=[9.0] * 2, c=[0.0] * 2, J=[1.0] * 2, beta=[0.2, 0.3], ratio=[0.3333, 1.0])
+    assert np.isnan(jax.jit(lambda s: s.half_turns())(shaft))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"ratio": [1.0, 0.3333, 1.0]}, f"common period of up to {MOST_TURNS} turns"),
+        ({"ratio": [1.0, "50/49", 1.0]}, "common period"),
+        ({"ratio": [1.0, 0.0, 1.0]}, r"ratio\[1\] = 0"),
+        ({"J": [1.0, 2.0]}, "J: 2 entries where k has 3"),
+        ({"beta": [0.1]}, "beta: 1 entry where k has 3"),
+    ],
+)
+def test_lists_that_do_not_match_are_refused_in_one_line(changes, message):
+    values: dict[str, Any] = {"speed": 9.0, "k": [9.0] * 3, "c": [0.0] * 3, "J": [1.0] * 3, "beta": [0.0, 0.2, 0.3]}
+    shaft = dt.Driveline(**values | changes)
+    with pytest.raises(dt.InputError, match=message) as raised:
+        dt.floquet(shaft)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("gears", [False, True])
+def test_half_a_period_is_enough_for_phases_of_a_quarter_turn(gears):
+    chain = random_chain(np.random.default_rng(7), 3, 2, gears) | {"phase": [0.0, math.pi / 2, 0.0]}
+    model = dt.Driveline(**chain).floquet_model()
+    assert model.reduced.span == model.natural.span / 2
+    assert farthest(multipliers_by_scipy(model.reduced), multipliers_by_scipy(model.natural)) < 1e-11
+    whole = dt.Driveline(**chain | {"phase": [0.0, 1.5, 0.0]}).floquet_model()
+    assert whole.reduced.span == whole.natural.span
+
+
+@cache
+def lagrange_cases() -> list:
+    rng = np.random.default_rng(8)
+    sizes = [(3, 1), (4, 2), (3, 2), (5, 3), (4, 3), (6, 3), (5, 1), (8, 2), (7, 3), (8, 3)]
+    return [random_chain(rng, n, joints, gears=i % 3 == 1) for i, (n, joints) in enumerate(sizes)]
+
+
+def test_linearisation_is_that_of_lagrange_multipliers():
+    for chain in lagrange_cases()[:3]:
+        shaft = dt.Driveline(**chain)
+        root = np.sqrt(np.array([*chain["J"], *chain["J"]]))
+        found = np.asarray(quick_jit(shaft.floquet_model().reduced.matrix)(1.3)) / root[:, None] * root
+        np.testing.assert_allclose(found, oracle.linear_matrix(chain, 1.3), rtol=0, atol=1e-11 * abs(found).max())
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("number", range(10))
+def test_multipliers_are_those_of_lagrange_multipliers(number):
+    chain = lagrange_cases()[number]
+    found = dt.floquet(dt.Driveline(**chain), outputs=["floquet_multiplier", "floquet_multiplier_error"])
+    period = float(dt.Driveline(**chain).floquet_model().natural.span)
+    expected = oracle.multipliers(chain, period)
+    assert farthest(found.floquet_multiplier, expected) < 1e-9
+    bound = np.max(found.floquet_multiplier_error)
+    assert farthest(found.floquet_multiplier, expected) < bound + 1e-10
+
+
+@pytest.mark.full
+def test_gradient_of_the_spectral_radius_is_that_of_differences():
+    shaft = of_case("ref2")
+    radius = lambda s: dt.floquet(s, outputs=["spectral_radius"], rtol=1e-13).spectral_radius  # noqa: E731
+    slope = jax.grad(radius)(shaft)
+    for name, i in (("k", 1), ("c", 2), ("J", 0), ("beta", 2), ("phase", 1)):
+        values = CASES["ref2"][name]
+        step = 1e-4 * max(abs(values[i]), 0.1)
+        ends = [
+            radius(of_case("ref2", **{name: [*values[:i], values[i] + s, *values[i + 1 :]]})) for s in (-step, step)
+        ]
+        assert getattr(slope, name)[i] == pytest.approx((ends[1] - ends[0]) / (2 * step), rel=1e-5, abs=1e-8)
+    # The period depends on the ratios before a joint, so a derivative exists by the last one alone.
+    assert np.isnan(slope.ratio[0])
+    assert np.isfinite(slope.ratio[2])
+
+
+@pytest.mark.full
+def test_undamped_multipliers_are_on_the_circle_outside_tongues():
+    """The Jacobian in twists is not Hamiltonian: it says 1.000881 for this chain (theory/driveline.md)."""
+    found = dt.floquet(of_case("ref2", c=[0.0] * 3), outputs=["spectral_radius", "verdict"])
+    assert found.verdict == 0
+    assert found.spectral_radius == 1
+
+
+@pytest.mark.full
+def test_energy_is_balanced_without_damping():
+    """Kinetic and elastic energy plus the work at the driven end, over 1,000 turns of the nonlinear field."""
+    case = CASES["ref2"]
+    shaft = of_case("ref2", c=[0.0] * 3)
+    n, w = 3, case["speed"]
+
+    def extended(tau, y):
+        slopes = shaft.vector_field(tau, y[:-1])
+        # No joint at the driven end: the source feels the first torque.
+        return jnp.append(slopes, shaft.k[0] * y[0] / w**2)
+
+    field = jax.jit(extended)
+    start = jnp.array([0.3, -0.2, 0.1, 0.05, 0.2, -0.1, 0.0])
+
+    def step(k, y, h):
+        # Gauss-Legendre collocation of order 8 by fixed-point iteration.
+        from drivetrain_jax.analysis.numerics.collocation import gauss
+
+        a, b, c = gauss(4)
+        tau = (k + c) * h
+
+        def iterate(_, slopes):
+            return jax.vmap(lambda t, x: extended(t, x))(tau, y + h * a @ slopes)
+
+        slopes = jax.lax.fori_loop(0, 14, iterate, jnp.broadcast_to(field(k * h, y), (4, 7)))
+        return y + h * b @ slopes
+
+    def energy(tau, y):
+        theta, rates = y[:n], y[n : 2 * n]
+        speeds = absolute(shaft, tau, theta, rates)
+        return (
+            0.5 * sum(j * v**2 for j, v in zip(shaft.J, speeds, strict=True))
+            + 0.5 / w**2 * sum(k * x**2 for k, x in zip(shaft.k, theta, strict=True))
+            + y[-1]
+        )
+
+    per_turn = 400
+    h = 2 * math.pi / per_turn
+    turns = 1000
+    end = jax.jit(lambda y: jax.lax.fori_loop(0, turns * per_turn, lambda k, y: step(k, y, h), y))(start)
+    first, last = energy(0.0, start), energy(2 * math.pi * turns, end)
+    assert abs(last - first) < 1e-10 * abs(first)
+
+
+def absolute(shaft, tau, theta, rates):
+    """Rates of the inertias, by the formula of a joint with atan2."""
+    a, speeds = tau, [1.0]
+    for beta, phase, r, x, v in zip(*shaft.chain, theta, rates, strict=True):
+        c, phi = math.cos(beta), a + phase
+        rho = (1 - c) / (1 + c)
+        eta = c / (1 - math.sin(beta) ** 2 * jnp.sin(phi) ** 2)
+        a = r * (a - jnp.arctan2(rho * jnp.sin(2 * phi), 1 + rho * jnp.cos(2 * phi))) + x
+        speeds.append(r * eta * speeds[-1] + v)
+    return speeds[1:]
+
+
+@pytest.mark.full
+def test_forced_response_and_history_of_one_joint_are_those_of_cardan():
+    chains, shafts = pairs(4)
+    for chain, shaft in zip(chains, shafts, strict=True):
+        found, expected = (dt.forced(s, outputs=["periodic_state", "amplitude"]) for s in (chain, shaft))
+        np.testing.assert_allclose(found.periodic_state, expected.periodic_state, rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(found.amplitude, expected.amplitude, rtol=1e-7)
+        found, expected = (dt.history(s, stop=20.0, num=11) for s in (chain, shaft))
+        np.testing.assert_allclose(found.theta[:, 1], expected.theta2, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(found.theta_rate[:, 0], expected.theta1_rate, rtol=0, atol=1e-8)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("case", REFERENCE["orbit"]["cases"], ids=lambda case: case["case"])
+def test_nonlinear_orbits_are_those_of_the_reference(case):
+    """The first-order orbit of the reference, and the orbit itself unless it is far from the first-order one."""
+    beta = [case["beta_scale"] * b for b in CASES[case["case"]]["beta"]]
+    outputs = ["periodic_state", "orbit_state", "orbit_spectral_radius"]
+    found = dt.forced(of_case(case["case"], beta=beta), outputs=outputs)
+    np.testing.assert_allclose(found.periodic_state, case["first_order_y0"], rtol=0, atol=1e-8)
+    if case["case"] != "ref3":
+        np.testing.assert_allclose(found.orbit_state, case["y0"], rtol=0, atol=1e-7)
+        assert found.orbit_spectral_radius == pytest.approx(max(case["abs_multipliers"]), abs=1e-7)
