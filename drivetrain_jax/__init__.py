@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         history,
         lyapunov,
         modes,
+        phasing,
         poincare,
         steady_state,
     )
@@ -87,6 +88,7 @@ __all__ = [
     "modes",
     "open_atlas",
     "open_result",
+    "phasing",
     "plot",
     "poincare",
     "point",

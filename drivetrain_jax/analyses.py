@@ -154,6 +154,20 @@ def critical_speeds(system: System, *, outputs: Sequence[str] | None = None, **o
     return analyse("critical_speeds", system, outputs, options)
 
 
+def phasing(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
+    """Uneven rotation of the rigid output of a driveline, and the phases of the yokes that minimise it.
+
+    Args as of :func:`floquet`. Outputs: ``speed_variation`` (peak to peak over the mean), ``angle_variation`` [rad],
+    ``least_variation``, ``best_phase`` (joint,) [rad].
+
+    >>> import drivetrain_jax as dt
+    >>> line = {"speed": 100.0, "k": [1e4, 1e4], "c": [0.1, 0.1], "J": [0.1, 1.0]}
+    >>> print(f"{dt.phasing(dt.Driveline(beta=['30 deg', '30 deg'], **line)).speed_variation:.5f}")
+    0.58333
+    """
+    return analyse("phasing", system, outputs, options)
+
+
 def modes(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
     """Natural frequencies [Hz] of a planetary gear, rising, with the type of each mode.
 

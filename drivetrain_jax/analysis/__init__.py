@@ -27,6 +27,7 @@ _BUILT_IN = (
     "lyapunov",
     "poincare",
     "parameters",
+    "phasing",
     "modes",
     "harmonic_response",
     "steady_state",

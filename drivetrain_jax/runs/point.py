@@ -31,6 +31,7 @@ class PointResult:
     ``outcome`` is the outcome of the point (results are NaN unless ``outcome.has_value``), ``units`` the units by name,
     ``labels`` the entries of each dimension of the results, ``physical`` the given physical data and their units,
     ``growth`` what a spectral radius means: rate [1/s], factor per turn, time and turns to double or to halve,
+    ``sentence`` the answer of an analysis that has one,
     ``sensitivities`` those of the spectral radius, largest effect of one percent first (None unless asked for).
     """
 
@@ -48,6 +49,7 @@ class PointResult:
     advice: str = field(default="", repr=False)
     orders: OrderCrossings | None = field(default=None, repr=False)
     growth: Mapping[str, float] = field(default_factory=dict, repr=False)
+    sentence: str = field(default="", repr=False)
     forced: tuple[str, Mapping[str, Any]] | None = field(default=None, repr=False)
     sensitivities: Sequence[Any] | None = field(default=None, repr=False)
     _effects: Sequence[str] = field(default=(), repr=False)
@@ -107,14 +109,14 @@ class PointResult:
             **({} if effects is None else {"sensitivities": effects}),
             **({"crossings": crossings} if crossings else {}),
         }
-        return Reply(self._lines(), answer)
+        return Reply(self._lines(), answer, self.sentence)
 
     def to_json(self) -> str:
         """The answer as one JSON object; numbers that are not finite are null."""
         return self._reply.to_json()
 
     def __repr__(self) -> str:
-        return "\n".join(self._lines())
+        return self._reply.text
 
     def _lines(self) -> list[str]:
         # An empty list is the default "none".
@@ -282,6 +284,7 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
     parameters = {p.parameter.name: p.values[0].item() for a in scene.axes for p in a.together} | dict(scene.fixed)
     ordered = {p.name: parameters[p.name] for p in scene.system.parameters if p.name in parameters}
     physical = _physical(job)
+    says = scene.analysis.model(scene.system).says
     return PointResult(
         system=scene.system.name,
         analysis=scene.analysis.name,
@@ -297,6 +300,7 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
         advice=scene.analysis.advice(scene.request),
         growth=growth_of(scene.system, ordered, values, speed_in_rpm(scene.system, physical)),
         orders=order_crossings(scene, ordered, values),
+        sentence=says(values, ordered) if says and outcome.has_value else "",
     )
 
 

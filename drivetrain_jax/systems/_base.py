@@ -197,7 +197,7 @@ _MODELS: dict[str, type] = {
     **dict.fromkeys(("floquet", "atlas"), FloquetModel),
     "forced": ForcedModel,
     **dict.fromkeys(("history", "lyapunov", "poincare"), Flow),
-    "parameters": Mapping,
+    **dict.fromkeys(("parameters", "phasing"), Mapping),
     **dict.fromkeys(("steady_state", "basins", "frequency_response"), PiecewiseLinearOscillator),
     "modes": SpringSystem,
     "harmonic_response": DrivenSprings,
@@ -224,6 +224,8 @@ class Model:
     results: tuple[Variable, ...] = ()
     #: Names of those ``results`` that are computed by default; empty: all.
     default_outputs: tuple[str, ...] = ()
+    #: ``says(values, parameters)``: the answer of a point in one sentence.
+    says: Callable[[Values, Values], str] | None = None
     #: Class of the model if it is not the usual one of the analysis (``history``: a flow).
     returns: type | None = None
 

@@ -22,9 +22,9 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
-from drivetrain_jax._quantities import Component, Dimension
+from drivetrain_jax._quantities import Component, Dimension, Variable
 from drivetrain_jax._wording import counted
-from drivetrain_jax.systems._base import POSITIVE, Number, System, Values, numeric, parameter, serves
+from drivetrain_jax.systems._base import POSITIVE, RPM, Number, System, Values, numeric, parameter, serves
 from drivetrain_jax.systems._models import (
     Block,
     FloquetModel,
@@ -40,6 +40,8 @@ from drivetrain_jax.systems.cardan import speed_ratio
 Components = Sequence[Any]
 # A list is also an array, and each entry a number, an array of lanes, or a text such as "41/11".
 Entries = Any
+
+_LISTS = ("k", "c", "J", "beta", "phase", "ratio")
 
 # Gears and the common period of the joints.
 
@@ -169,18 +171,24 @@ def rigid_motion(
     return found
 
 
+def behind(beta: Any, phase: Any, angle: Any) -> Any:
+    """The rotation F behind a joint whose input has turned by ``angle``, eq. (1)."""
+    rho, twice = jnp.tan(beta / 2) ** 2, 2 * (angle + phase)
+    return angle - jnp.arctan2(rho * jnp.sin(twice), 1 + rho * jnp.cos(twice))
+
+
 def _is_straight(beta: Any) -> bool:
     return _is_number(beta) and beta == 0
 
 
 def check(fixed: Values) -> None:
     """``ValueError`` unless all lists have one entry per element, ratios are not 0, and the joints have a common period."""
-    count = len(fixed["k"])
-    for name in ("c", "J", "beta", "phase", "ratio", "theta_0", "theta_rate_0"):
-        value = fixed.get(name, ())
-        if value != () and len(value) != count:
+    lists = {name: fixed[name] for name in (*_LISTS, "theta_0", "theta_rate_0") if fixed.get(name, ()) != ()}
+    first, count = next(((name, len(value)) for name, value in lists.items()), ("", 0))
+    for name, value in lists.items():
+        if len(value) != count:
             raise ValueError(
-                f"{name}: {counted(len(value), 'entry', 'entries')} where k has {count}; allowed is one per element"
+                f"{name}: {counted(len(value), 'entry', 'entries')} where {first} has {count}; allowed is one per element"
             )
     ratio, speed, speeds = fixed.get("ratio", ()), 1.0, []
     for i, (r, b) in enumerate(zip(ratio, fixed.get("beta", ()), strict=False)):
@@ -196,6 +204,112 @@ def check(fixed: Values) -> None:
             f"ratio = {list(ratio)}: the joints have no common period of up to {MOST_TURNS} turns; allowed between joints "
             'are ratios of few teeth, such as "41/11"'
         )
+
+
+# The uneven rotation of the rigid chain, and phases that remove it.
+
+
+# Samples of a period from which extremes are refined, and hyperbolic length below which joints cancel.
+_SAMPLES, _CANCELLED = 4096, 1e-9
+
+
+def _range(function: Callable[[Any], Any], period: Any) -> Any:
+    """Largest minus smallest value of a smooth function of that ``period``, ``(...)``, by samples and Newton's method."""
+    step = jnp.asarray(period, float) / _SAMPLES
+    times = step * jnp.arange(_SAMPLES).reshape(-1, *(1,) * step.ndim)
+    slope = lambda t: jax.jvp(function, (t,), (jnp.ones_like(t),))[1]  # noqa: E731
+    values, ends = function(times), []
+    for place in (jnp.argmax(values, axis=0), jnp.argmin(values, axis=0)):
+        start = step * place
+        t = start
+        for _ in range(4):
+            first, second = jax.jvp(slope, (t,), (jnp.ones_like(t),))
+            moved = t - first / jnp.where(second == 0, jnp.inf, second)
+            t = jnp.clip(moved, start - step, start + step)
+        ends.append(function(t))
+    return ends[0] - ends[1]
+
+
+def _moved(b: Any, rho: Any, phase: Any) -> Any:
+    """The image of ``b`` under the joint, eq. (4)."""
+    a = rho * jnp.exp(-2j * phase)
+    return (b + a) / (1 + jnp.conj(a) * b)
+
+
+def best_phases(beta: Components, phase: Components, ratio: Components) -> list[Any]:
+    """Phases in [0, pi) that minimise the uneven rotation between gears; the first joint behind a gear keeps its own.
+
+    A joint moves a point of the hyperbolic plane by l = ln sec(beta) in the direction of its phase, eq. (8). The path closes
+    if no l is longer than all others together; each joint turns back as far as the remaining ones can make up for.
+    """
+    found, b, lengths = [], jnp.zeros((), complex), [-jnp.log(jnp.cos(x)) for x in beta]
+    for i, (p, length) in enumerate(zip(phase, lengths, strict=True)):
+        # Joints behind the next gear make up for nothing.
+        together, total, longest = True, 0.0, 0.0
+        for r, after in zip(ratio[i:], lengths[i + 1 :], strict=False):
+            together &= r == 1
+            total, longest = total + after * together, jnp.maximum(longest, after * together)
+        size = jnp.abs(b)
+        distance, free = 2 * jnp.arctanh(size), 2 * jnp.arctanh(size) < _CANCELLED
+        back = jnp.abs(distance - length)
+        goal = jnp.clip(jnp.clip(back, jnp.maximum(0.0, 2 * longest - total), total), back, distance + length)
+        volume = jnp.sinh(distance) * jnp.sinh(length)
+        cosine = (jnp.cosh(goal) - jnp.cosh(distance) * jnp.cosh(length)) / jnp.where(volume == 0, 1.0, volume)
+        # Straight back without the rounding of the cosine.
+        cosine = jnp.where(goal <= back, -1.0, jnp.clip(cosine, -1.0, 1.0))
+        turned = (jnp.arccos(cosine) - jnp.angle(jnp.where(free, 1.0, b))) / 2
+        found.append(jnp.mod(jnp.where(free | (length == 0), p, turned), math.pi))
+        b = jnp.where(ratio[i] == 1, _moved(b, jnp.tan(beta[i] / 2) ** 2, found[-1]), 0.0)
+    return found
+
+
+def uneven_rotation(beta: Components, phase: Components, ratio: Components, half_turns: Any) -> tuple[Any, Any]:
+    """Range of the speed of the rigid output over its mean, and of its lead [rad], peak to peak.
+
+    Without gears the chain is one joint, eq. (8): 4 rho/(1 - rho^2) and 2 asin(rho).
+    """
+    last = max((i for i, x in enumerate(beta) if not _is_straight(x)), default=0)
+    if all(_is_number(r) and r == 1 for r in ratio[:last]):
+        b: Any = jnp.zeros((), complex)
+        for angle, p in zip(beta, phase, strict=True):
+            b = _moved(b, jnp.tan(angle / 2) ** 2, p)
+        rho = jnp.abs(b)
+        return 4 * rho / (1 - rho**2), 2 * jnp.arcsin(rho) * abs(math.prod(ratio[last:]))
+    mean = math.prod(ratio)
+
+    def lead(tau: Any) -> Any:
+        angle = tau
+        for b, p, r in zip(beta, phase, ratio, strict=True):
+            angle = r * behind(b, p, angle)
+        return angle - mean * tau
+
+    def speed(tau: Any) -> Any:
+        return jax.jvp(lead, (tau,), (jnp.ones_like(tau),))[1] / mean
+
+    shape = jnp.broadcast_shapes(*map(jnp.shape, (*beta, *phase, *ratio)))
+    period = jnp.broadcast_to(math.pi * jnp.asarray(half_turns), shape)
+    return _range(speed, period), _range(lead, period)
+
+
+PHASING = (
+    Variable("speed_variation", "1", "speed of the rigid output, peak to peak over its mean", lower=0.0),
+    Variable("angle_variation", "rad", "lead of the rigid output, peak to peak", lower=0.0),
+    Variable("least_variation", "1", "speed_variation with the phases best_phase", lower=0.0),
+    Variable("best_phase", "rad", "phases that minimise speed_variation", ("joint",)),
+)
+
+
+def phasing_sentence(values: Values, parameters: Values) -> str:
+    """The answer in one sentence."""
+    part, degrees, least = values["speed_variation"], np.degrees(values["angle_variation"]), values["least_variation"]
+    speed = parameters.get("speed")
+    mean = abs(math.prod(parameters.get("ratio") or (1.0,)))
+    rpm = f", {part * speed * mean / RPM:.4g} rpm at {speed * mean / RPM:.5g} rpm" if speed else ""
+    phases = ", ".join(f"{np.degrees(p):.4g}" for p in values["best_phase"])
+    best = f"with the phases [{phases}] deg by {round(100 * least, 9):.4g} %"
+    if part - least <= 1e-9 * part + 1e-12:
+        best = "no phases make it less"
+    return f"The output speed varies by {round(100 * part, 9):.4g} % peak to peak ({degrees:.4g} deg{rpm}); {best}."
 
 
 def panels_needed(line: Driveline, rtol: float) -> Any:
@@ -227,7 +341,7 @@ def panels_needed(line: Driveline, rtol: float) -> Any:
     return light * (1e-9 / rtol) ** 0.1 + xp.sqrt(time * decay / 2)
 
 
-_CHAIN = ("speed", "k", "c", "J", "beta", "phase", "ratio")
+_CHAIN = ("speed", *_LISTS)
 SHAFT = Dimension("shaft", "number of the shaft from the driven end", ())
 _LIST = {"listed": True, "lower": 0.0}
 _NONE: dict[str, Any] = {"default": (), "listed": True}
@@ -273,7 +387,9 @@ class Driveline(System):
 
     def entries(self, name: str, none: float = 0.0) -> Components:
         """One entry of the list ``name`` for each element; ``none`` for an empty list."""
-        return getattr(self, name) or (none,) * len(self.k)
+        # The rigid motion needs no stiffness.
+        count = len(self.k or self.beta or self.phase or self.ratio)
+        return getattr(self, name) or (none,) * count
 
     @property
     def chain(self) -> tuple[Components, Components, Components]:
@@ -334,10 +450,8 @@ class Driveline(System):
         theta, rates = list(y[:count]), list(y[count:])
         angle, rate, ratios, excess = tau, 1.0, [], []
         for b, p, r, twist, slope in zip(*self.chain, theta, rates, strict=True):
-            phi = angle + p
-            eta, by_angle, _ = speed_ratio(b, phi)
-            rho = jnp.tan(b / 2) ** 2
-            angle = r * (angle - jnp.arctan2(rho * jnp.sin(2 * phi), 1 + rho * jnp.cos(2 * phi))) + twist
+            eta, by_angle, _ = speed_ratio(b, angle + p)
+            angle = r * behind(b, p, angle) + twist
             excess.append(r * by_angle * rate**2)
             ratios.append(r * eta)
             rate = ratios[-1] * rate + slope
@@ -491,6 +605,15 @@ class Driveline(System):
         return FloquetModel(
             natural=natural, reduced=reduced, panels=own(kind.panels), hamiltonian=own(kind.is_hamiltonian)
         )
+
+    @serves("phasing", check=check, parameters=("beta", "phase", "ratio"), results=PHASING, says=phasing_sentence)
+    def phasing(self) -> dict[str, Any]:
+        """Uneven rotation of the rigid output, and the phases that minimise it."""
+        beta, phase, ratio = self.chain
+        best = best_phases(beta, phase, ratio)
+        variation, angle = uneven_rotation(beta, phase, ratio, self.half_turns())
+        least, _ = uneven_rotation(beta, best, ratio, self.half_turns())
+        return {"speed_variation": variation, "angle_variation": angle, "least_variation": least, "best_phase": best}
 
     @serves("modes", check=check, parameters=("k", "J", "ratio"))
     def springs(self) -> SpringSystem:

@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
 
 import drivetrain_jax as dt
-from drivetrain_jax.systems.driveline import MOST_TURNS
+from drivetrain_jax.systems.driveline import MOST_TURNS, best_phases, uneven_rotation
 from tests.oracles import driveline_reference as oracle
 from tests.quick_jit import quick_jit
 from tests.sizes import full_after
@@ -331,3 +331,59 @@ def test_nonlinear_orbits_are_those_of_the_reference(case):
     if case["case"] != "ref3":
         np.testing.assert_allclose(found.orbit_state, case["y0"], rtol=0, atol=1e-7)
         assert found.orbit_spectral_radius == pytest.approx(max(case["abs_multipliers"]), abs=1e-7)
+
+
+def rotation(beta, phase, **more) -> Any:
+    return dt.point("driveline", "phasing", beta=list(beta), phase=list(phase), **more)
+
+
+@pytest.mark.parametrize("case", REFERENCE["speed_variation"]["cases"], ids=lambda case: str(case["beta"]))
+def test_uneven_rotation_is_that_of_the_reference(case):
+    ones = (1.0,) * len(case["beta"])
+    variation, lead = uneven_rotation(case["beta"], case["phase"], ones, 1.0)
+    assert variation == pytest.approx(case["unevenness"], abs=1e-13)
+    rho = math.tan(case["equivalent_beta"] / 2) ** 2
+    assert lead == pytest.approx(2 * math.asin(rho), abs=1e-12)
+    # The same by sampling the rotation, as a chain with gears needs it.
+    by_samples = uneven_rotation(case["beta"], case["phase"], tuple(map(np.array, ones)), 1.0)
+    np.testing.assert_allclose(by_samples, (variation, lead), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "lengths", [(0.3,), (0.2, 0.2), (0.1, 0.3), (0.3, 0.2, 0.4), (0.1, 0.5, 0.2), (0.2, 0.2, 0.2, 0.5)]
+)
+def test_best_phases_close_the_polygon_of_the_joints(lengths):
+    """No phases do better than the longest l = ln sec(beta) less all others, eq. (8)."""
+    beta = np.arccos(np.exp(-np.array(lengths))).tolist()
+    ones = (1.0,) * len(beta)
+    best = best_phases(beta, (0.4,) * len(beta), ones)
+    least, _ = uneven_rotation(beta, best, ones, 1.0)
+    assert best[0] == pytest.approx(0.4)
+    assert least == pytest.approx(2 * math.sinh(max(0.0, 2 * max(lengths) - sum(lengths))), abs=1e-12)
+
+
+def test_the_answer_on_phasing_agrees_with_published_rules():
+    """Elbe: U = .0027 at 2.9765 deg; 5 and 4 deg make 3.000 deg by the makers' rule, 3.0024 exactly; 30 + 30 deg."""
+    assert rotation(["2.9765 deg"], [0.0]).speed_variation == pytest.approx(0.0027, abs=2e-8)
+    well = rotation(["5 deg", "4 deg"], [0.0, "90 deg"])
+    rho = math.tan(math.radians(3.0024) / 2) ** 2
+    assert well.speed_variation == pytest.approx(4 * rho / (1 - rho**2), rel=1e-4)
+    badly = rotation(["30 deg", "30 deg"], [0.0, 0.0], speed="600 rpm")
+    assert badly.speed_variation == pytest.approx(4 / 3 - 3 / 4, rel=1e-12)
+    np.testing.assert_allclose(badly.best_phase, [0.0, math.pi / 2], rtol=1e-12)
+    assert badly.least_variation < 1e-12
+    assert badly.sentence == (
+        "The output speed varies by 58.33 % peak to peak (16.43 deg, 350 rpm at 600 rpm); "
+        "with the phases [0, 90] deg by 0 %."
+    )
+    assert json.loads(badly.to_json())["answer"] == badly.sentence
+    assert str(badly).startswith(badly.sentence)
+
+
+def test_phases_across_a_gear_make_up_for_nothing():
+    found = rotation(["20 deg", "20 deg"], [0.0, 0.3], ratio=[2, 1])
+    alone = rotation(["20 deg"], [0.0])
+    np.testing.assert_allclose(found.best_phase, [0.0, 0.3], rtol=1e-12)
+    assert found.speed_variation == pytest.approx(found.least_variation, rel=1e-12)
+    # The first joint's speed, doubled, passes a joint of the double speed.
+    assert alone.speed_variation < found.speed_variation < 2 * alone.speed_variation * 1.01

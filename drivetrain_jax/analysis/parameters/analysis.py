@@ -22,39 +22,47 @@ MODE = "mode"
 _MODES = Parameter("modes", "1", "number of modes", default=5, lower=1, upper=1000, integer=True)
 
 
-def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+def _solve(
+    name: str, system: type[System], request: Request, values: Mapping[str, Any], effort: Array
+) -> dict[str, Array]:
     del effort
-    model = system.models["parameters"]
+    model = system.models[name]
+    own = {v.name for v in model.results if v.dims}
     constants, with_modes = model.build(values), {v.name for v in model.results if v.dims == (MODE,)}
 
     def value(name: str) -> Array:
-        if name not in with_modes:
+        if name not in own:
             return jnp.asarray(constants[name], float)
-        numbers = range(1, request.options[_MODES.name] + 1)
-        return jnp.stack([jnp.asarray(constants[name](k), float) for k in numbers])
+        listed = constants[name]
+        if name in with_modes:
+            listed = [constants[name](k) for k in range(1, request.options[_MODES.name] + 1)]
+        return jnp.stack(jnp.broadcast_arrays(*(jnp.asarray(x, float) for x in listed)))
 
     results = {name: value(name) for name in request.outputs}
-    # Every result gets an axis of modes before the batch, of length 1 if it has none.
-    finite = [jnp.isfinite(x if name in with_modes else x[None]) for name, x in results.items()]
-    whole = jnp.stack(jnp.broadcast_arrays(*(jnp.all(x, axis=0) for x in finite)))
+    finite = [jnp.all(jnp.isfinite(x if name in own else x[None]), axis=0) for name, x in results.items()]
+    whole = jnp.stack(jnp.broadcast_arrays(*finite))
     outcome = jnp.where(jnp.all(whole, axis=0), Outcome.SUCCESS, Outcome.NOT_FINITE)
     # An infinite constant has no value.
     results = {name: jnp.where(jnp.isfinite(x), x, jnp.nan) for name, x in results.items()}
     return results | {"outcome": outcome.astype(jnp.int8)}
 
 
-def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
-    return (Solver("closed form", partial(_solve, system, request), seconds=1e-7, chunk=4096),)
+def _solvers(name: str, system: type[System], request: Request) -> tuple[Solver, ...]:
+    return (Solver("closed form", partial(_solve, name, system, request), seconds=1e-7, chunk=4096),)
 
 
-def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+def _dimensions(name: str, system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     count = request.options.get(_MODES.name, 0)
-    return (Dimension(MODE, "number of the mode", tuple(range(1, count + 1))),)
+    others = {dim for v in system.models[name].results for dim in v.dims} - {MODE}
+    return (
+        Dimension(MODE, "number of the mode", tuple(range(1, count + 1))),
+        *(Dimension(dim, f"number of the {dim}", ()) for dim in sorted(others)),
+    )
 
 
-def _of_system(system: type[System]) -> dict[str, Any]:
+def _of_system(name: str, system: type[System]) -> dict[str, Any]:
     """The declared constants, and the number of modes as an option if a constant has modes."""
-    model = system.models["parameters"]
+    model = system.models[name]
     options = (_MODES,) if any(v.dims == (MODE,) for v in model.results) else ()
     return {
         "variables": model.results,
@@ -64,18 +72,22 @@ def _of_system(system: type[System]) -> dict[str, Any]:
     }
 
 
-ANALYSIS = Analysis(
-    name="parameters",
-    title="constants of the system",
-    variables=(),
-    default_outputs=(),
-    methods={"exact": ()},
-    method_titles={
-        "exact": "closed forms",
-    },
-    options=(),
-    solvers=_solvers,
-    dimensions=_dimensions,
-    derivatives=partial(forward_derivatives, _solvers),
-    of_system=_of_system,
-)
+def constants(name: str, title: str) -> Analysis:
+    """The analysis ``name``, whose results are the constants that a system declares for it."""
+    solvers = partial(_solvers, name)
+    return Analysis(
+        name=name,
+        title=title,
+        variables=(),
+        default_outputs=(),
+        methods={"exact": ()},
+        method_titles={"exact": "closed forms"},
+        options=(),
+        solvers=solvers,
+        dimensions=partial(_dimensions, name),
+        derivatives=partial(forward_derivatives, solvers),
+        of_system=partial(_of_system, name),
+    )
+
+
+ANALYSIS = constants("parameters", "constants of the system")
