@@ -30,10 +30,6 @@ BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 SHAFT = dt.Cardan(beta=0.3, Omega=1.416, **BASE)
 
 
-class Unregistered(dt.Cardan):
-    """A subclass that inherits the name of its parent."""
-
-
 GEARS = dt.Rattle(omega=0.7, **dt.Rattle.presets["table1"])
 TRIPOD = dt.Tripod(element="input", beta=0.157, zeta=0.0016, chi_n=0.3)
 
@@ -227,7 +223,7 @@ def declared(units="1", roles=(), model=None, **serving):
         (lambda: dt.history(dt.Tripod(element="input", beta=0.1, zeta=0.1, equation="26"), stop=1.0), "equation = '26'"),
         (lambda: dt.sweep(dt.floquet, SHAFT, over={}), "over: empty"),
         (lambda: dt.sweep(dt.floquet, SHAFT, over={"bet": [0.1]}), "bet: unknown parameter"),
-        (lambda: dt.sweep(dt.floquet, Unregistered(**SHAFT.values), over={"beta": [0.1]}), "got Unregistered, which is not"),
+        (lambda: dt.sweep(dt.floquet, dt.Cardan, over={"beta": [0.1]}), "system: got the class Cardan; allowed is a system"),
         (lambda: dt.sweep(dt.floquet, SHAFT, over={"beta": [[0.1]]}), r"over.beta: got an array of the shape \(1, 1\)"),
         (lambda: swept(lambda p: {"outcome": p["a"]}), "outcome: the function returns float64 of the shape"),
         (lambda: swept(len, {"k": [0.0, 1.0]}), r'k: an array cannot vary as a whole; allowed is one entry, .* "k\[0\]"'),

@@ -22,7 +22,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax._units import with_unit
 from drivetrain_jax._wording import nearest, shown
-from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analysis_names
+from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analysis_names, get_analysis
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.analysis.request import checked
 from drivetrain_jax.runs.axes import Axis, AxisTable, entry_of, spread
@@ -84,24 +84,21 @@ def sweep(
     of_another_package = isinstance(function, analyses.AnalysisFunction)
     own = function.name if of_another_package else getattr(function, "__name__", "")
     if of_another_package or (own in analysis_names() and getattr(analyses, own, None) is function):
-        return run(_scene_table(own, system, over, outputs, options), out=out, fresh=fresh)
+        if not isinstance(system, System):
+            given = f"the class {system.__name__}" if isinstance(system, type) else f"a {type(system).__name__}"
+            raise InputError(f"system: got {given}; allowed is a system such as drivetrain_jax.Cardan(...)")
+        if system.name in system_names() and get_system(system.name) is type(system):
+            return run(_scene_table(own, system, over, outputs, options), out=out, fresh=fresh)
+        # A scene names its system, so any other class is that of a function.
+        known = get_analysis(own).for_system(type(system)).variables
+        return run(_function_scene(function, system, over, outputs, options, known), out=out, fresh=fresh)
     return run(_function_scene(function, system, over, outputs, options), out=out, fresh=fresh)
 
 
 def _scene_table(
-    name: str, system: Any, over: Mapping[str, Any], outputs: Sequence[str] | None, options: Mapping[str, Any]
+    name: str, system: System, over: Mapping[str, Any], outputs: Sequence[str] | None, options: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The scene of an analysis of the package."""
-    if not isinstance(system, System):
-        raise InputError(
-            f"system: got a {type(system).__name__}; allowed is a system such as drivetrain_jax.Cardan(...)"
-        )
-    # A scene names its system; an unregistered subclass of a registered class would be solved as its parent.
-    if system.name not in system_names() or get_system(system.name) is not type(system):
-        raise InputError(
-            f"system: got {type(system).__name__}, which is not registered; expected an installed system, "
-            f"or a function such as lambda system: drivetrain_jax.{name}(system)"
-        )
+    """The scene of an analysis of an installed system."""
     # An empty list stands for a default of none.
     conversions = system.physical.conversions if system.physical else ()
     varied = {*over, *(each.parameter for each in conversions if each.needs[0] in over)}
@@ -155,8 +152,12 @@ def _function_scene(
     over: Mapping[str, Any],
     outputs: Sequence[str] | None,
     options: Mapping[str, Any],
+    results: Sequence[Variable] = (),
 ) -> Scene:
-    """The scene of a user's function: its parameters vary, and a fixed word identifies the computation."""
+    """The scene of a function: its parameters vary, and a fixed word identifies the computation.
+
+    ``results`` are those of a function that is an analysis, which takes ``outputs`` as an argument.
+    """
     if jax.tree_util.treedef_is_leaf(jax.tree.structure(system)):
         raise InputError(f"system: got a {type(system).__name__}; allowed is a pytree, such as a dict of numbers")
     known = {p.name: p for p in system.parameters} if isinstance(system, System) else {}
@@ -170,8 +171,10 @@ def _function_scene(
         values[name] = spread(AxisTable(None, None, None, None, _numbers(name, row)), f"over.{name}")
     name = re.sub(r"\W", "_", getattr(function, "__name__", "function")).strip("_") or "value"
 
+    own = {"outputs": outputs} if results and outputs is not None else {}
+
     def one(point: Mapping[str, Any]) -> dict[str, Array]:
-        return _named(function(replaced(system, point), **options), name)
+        return _named(function(replaced(system, point), **options, **own), name)
 
     example = {key: jax.ShapeDtypeStruct((), float) for key in values}
     traced, shapes = jax.make_jaxpr(one, return_shape=True)(example)
@@ -180,7 +183,8 @@ def _function_scene(
     wanted = _wanted(outputs, [key for key in shapes if key != OUTCOME.name], name)
     content = [re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr)), *(np.asarray(x).tobytes() for x in traced.consts)]
     computes = hashlib.blake2b(repr(content).encode(), digest_size=16).hexdigest()
-    variables = tuple(_variable(key, shapes[key]) for key in wanted)
+    words = {variable.name: variable for variable in results}
+    variables = tuple(_variable(key, shapes[key], words.get(key)) for key in wanted)
     kind, analysis = _kind(_Once(one), name, tuple(values), type(system), variables, computes)
     axes = tuple(Axis(key, kind.parameter(key), None, numbers) for key, numbers in values.items())
     names = [*(axis.dim for axis in axes), *wanted, *(dim for variable in variables for dim in variable.dims)]
@@ -259,9 +263,10 @@ def _with_outcome(results: Mapping[str, Array], code: Array | None) -> dict[str,
     return {n: jnp.where(finite, x, jnp.nan) if n in inexact else x for n, x in results.items()} | {OUTCOME.name: state}
 
 
-def _variable(name: str, shape: jax.ShapeDtypeStruct) -> Variable:
+def _variable(name: str, shape: jax.ShapeDtypeStruct, described: Variable | None) -> Variable:
     dtype = "int8" if shape.dtype == bool else str(shape.dtype)
-    return Variable(name, "1", name, tuple(f"{name}_{i}" for i in range(len(shape.shape))), dtype)
+    dims = tuple(f"{name}_{i}" for i in range(len(shape.shape)))
+    return replace(described, dims=dims) if described else Variable(name, "1", name, dims, dtype)
 
 
 def _named(result: Any, name: str) -> dict[str, Array]:

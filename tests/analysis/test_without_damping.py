@@ -70,6 +70,24 @@ def test_an_ince_strutt_diagram_has_stable_regions(method):
     assert np.all(np.asarray(found.spectral_radius)[expected] == 1)
 
 
+class Unregistered(dt.Cardan):
+    """A subclass that inherits the name of its parent, which must not be solved in its place."""
+
+    @serves("floquet")
+    def floquet_model(self):
+        return Mathieu(a=self.Omega, q=self.beta).floquet_model()
+
+
+def test_a_class_that_is_not_installed_is_swept(tmp_path):
+    shaft = Unregistered(beta=0.5, Omega=2.0, zeta=0.1, alpha=1.0, mu=1.0, gamma=1.0)
+    outputs = ["spectral_radius", "verdict"]
+    chart = dt.sweep(dt.floquet, shaft, over={"Omega": [1.0, 2.0]}, outputs=outputs, out=tmp_path / "chart.nc")
+    assert chart.drivetrain.named().verdict.values.tolist() == ["unstable", "stable"]
+    assert chart.verdict.attrs["long_name"] == "stability of the equilibrium"
+    assert set(chart.data_vars) == {*outputs, "outcome"}
+    assert not [str(f) for f in check(chart) if f.broken] and dt.plot(chart).axes
+
+
 # a, q and |trace|/2 - 1 at edges of bands, by Taylor series of 260 bits: within the period solutions grow up to 1e12 times.
 EDGES = np.array([
     (-152.86096230651398, 132.25485445667033, 0.15308510132462463),
