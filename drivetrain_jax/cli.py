@@ -6,6 +6,7 @@ Heavy imports are local, so ``--help`` is fast and each command loads only its o
 from __future__ import annotations
 
 import argparse
+import errno
 import gc
 import io
 import os
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 __all__ = ["main"]
 
 OK, WRONG_INPUT, INCOMPLETE, INTERRUPTED = 0, 2, 3, 130
+# Errors of standard output: a reader that has left, a full disk.
+_OUTPUT = (errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EIO)
 _FIGURES = (".png", ".pdf", ".svg")
 # Tables of constants, and their separators.
 _TABLES = {".txt": "", ".csv": ","}
@@ -61,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(one_line(str(error)))
         return INCOMPLETE if isinstance(error, ChunkError) else WRONG_INPUT
     except OSError as error:
-        if error.filename is None and error.errno is None:
+        if error.filename is None and error.errno not in _OUTPUT:
             raise
         if error.filename is None:
             # Python would try to write buffered output again at exit.

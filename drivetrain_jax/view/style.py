@@ -182,24 +182,19 @@ def caption(dataset: xr.Dataset) -> str:
     """
     given = _given(dataset)
     # Physical data are shown as they were given, in place of the parameters that follow from them.
-    fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}")) | json.loads(
-        dataset.attrs.get("physical_data", "{}")
-    )
-    named = set().union(*given.values())
-    scalars = {
-        str(name): c for name, c in dataset.coords.items() if c.ndim == 0 and _says_something(str(name), c, fixed)
-    }
-    shown = [] if is_joined(dataset) else [name for name in fixed if name in given["fixed"]]
+    tables = (json.loads(dataset.attrs.get(name, "{}")) for name in ("fixed_parameters", "physical_data"))
+    fixed = {name: entry for table in tables for name, entry in table.items()}
     varies = {str(name) for name in (*dataset.coords, *dataset.dims)}
-    parts = [_fixed_text(dataset, name, fixed[name]) for name in shown if name not in varies]
-    parts += [coordinate_text(coordinate) for name, coordinate in scalars.items() if name in named or name not in fixed]
+    shown = [] if is_joined(dataset) else [name for name in fixed if name in given["fixed"] and name not in varies]
+    parts = [_fixed_text(dataset, name, fixed[name]) for name in shown]
+    named = set().union(*given.values())
+    for name, coordinate in dataset.coords.items():
+        # An entry of a list may be shown as a part of the whole.
+        whole = scene_key(coordinate).partition("[")[0]
+        known = whole in fixed if whole != name else name in fixed and name not in named
+        if not coordinate.ndim and name != "point" and not known:
+            parts.append(coordinate_text(coordinate))
     return ", ".join([*parts, *([dataset.attrs["left_out"]] if "left_out" in dataset.attrs else [])])
-
-
-def _says_something(name: str, coordinate: xr.DataArray, fixed: dict[str, object]) -> bool:
-    """False for the number of a point in a list, and for an entry of a list that is shown as a whole."""
-    whole = scene_key(coordinate).partition("[")[0]
-    return name != "point" and (whole == name or whole not in fixed)
 
 
 def is_joined(dataset: xr.Dataset) -> bool:
