@@ -228,6 +228,7 @@ BUILT_IN = {
     ),
     "history": Declared(),
     "parameters": Declared(),
+    "phasing": Declared(),
     "harmonic_response": Declared(),
     "steady_state": Declared(
         (

@@ -15,6 +15,7 @@ import pytest
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from drivetrain_jax._rules import BUILT_IN
 from drivetrain_jax.analysis import analysis_names, get_analysis
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
@@ -70,6 +71,10 @@ def test_no_files_import_each_other():
     assert len(names) > 100 and len(rows) > 500
     cycles = [[name for name, label in zip(names, labels, strict=True) if label == k] for k in np.unique(labels)]
     assert [cycle for cycle in cycles if len(cycle) > 1] == []
+
+
+def test_every_analysis_of_the_package_has_a_record():
+    assert set(BUILT_IN) == {path.parent.name for path in (ROOT / "drivetrain_jax/analysis").glob("*/analysis.py")}
 
 
 HEAVY = ("jax", "numpy", "scipy", "xarray", "diffrax", "matplotlib", "h5py")
