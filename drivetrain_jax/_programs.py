@@ -1,16 +1,16 @@
 """Compiled code on disk, shared by the processes of a user: JAX's own cache, and programs that need no tracing either.
 
-Programs are stored under a digest of everything that affects them.
+Programs are stored under a digest of everything that affects them. JAX's own cache finds compiled code only after tracing,
+which takes two thirds of the time of an answer.
 """
 
 from __future__ import annotations
 
 import hashlib
-import inspect
 import os
 import pickle
 import secrets
-import tempfile
+import sys
 import threading
 import zlib
 from collections.abc import Callable, Mapping
@@ -22,7 +22,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from filelock import FileLock, Timeout
 from jax.experimental import serialize_executable
 
 import drivetrain_jax
@@ -31,10 +30,13 @@ from drivetrain_jax.analysis import Analysis, get_analysis
 from drivetrain_jax.store.files import digest, source_digest, versions, write_atomic
 from drivetrain_jax.systems import System
 
-_VARIABLE = "DRIVETRAIN_JAX_CACHE"
-_MAX_BYTES = 1 << 29
-# With a limit of size jax reads a date for each entry whenever it keeps a program: 7 us an entry.
-_MAX_ENTRIES = 1000
+# Most entries of JAX's cache and most programs; a program takes some 300 kB.
+_ENTRIES, _PROGRAMS = 1000, 256
+# Bytes of the digest in front of a program.
+_DIGEST = 16
+# Errors of a kernel that cannot be stored, or of a file that is missing, damaged or of no use here.
+_UNUSABLE = (OSError, ValueError, TypeError, KeyError, AttributeError, NotImplementedError, pickle.PickleError)
+_UNUSABLE += (jax.errors.JaxRuntimeError,)
 
 
 def enable(*, short: bool = False) -> None:
@@ -43,66 +45,45 @@ def enable(*, short: bool = False) -> None:
     A cache that the user has configured stays unchanged. Without a writable folder there is no cache. With ``short``
     programs that compile in less than a second are kept too; until then the user's own small programs are not.
     """
-    wanted = os.environ.get(_VARIABLE, "")
-    folder = _folder(wanted)
     used = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    if wanted == "0" or (used and used != str(folder)):
-        return
-    if not used:
-        if not _writable(folder):
-            return
-        _prune(folder)
+    if not used and (folder := _folder()) is not None and _is_private(folder):
+        _trim(folder, _ENTRIES)
         jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_compilation_cache_max_size", _MAX_BYTES)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    if short:
+    if short and programs():
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 
 
 def programs() -> Path | None:
     """The folder of stored programs; None without a cache, or with one that the user has configured."""
-    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    wanted = os.environ.get(_VARIABLE, "")
-    return Path(folder) / "programs" if wanted != "0" and folder == str(_folder(wanted)) else None
+    used = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    return Path(used) / "programs" if used and used == str(_folder()) else None
 
 
-def _folder(wanted: str) -> Path:
-    """One folder per instruction set and jax version, because compiled code is not portable."""
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    root = Path(wanted) if wanted else base / "drivetrain_jax"
+def _folder() -> Path | None:
+    """One folder per instruction set and jax version, because compiled code is not portable; None if it is turned off."""
+    wanted = os.environ.get("DRIVETRAIN_JAX_CACHE", "")
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "drivetrain_jax"
     content = " ".join((*sorted(instruction_set()), jax.__version__))
-    return root / hashlib.blake2b(content.encode(), digest_size=16).hexdigest()
+    name = hashlib.blake2b(content.encode(), digest_size=16).hexdigest()
+    return None if wanted == "0" else Path(wanted or base) / name
 
 
-def _prune(folder: Path) -> None:
-    """Remove entries without a date, with which jax stores no further program, and of too many those used longest ago."""
-    entries = {path.name.removesuffix("-cache") for path in folder.glob("*-cache")}
-    dates = {path.name.removesuffix("-atime"): path for path in folder.glob("*-atime")}
-    surplus = entries - dates.keys()
-    try:
-        if len(entries) > _MAX_ENTRIES:
-            by_use = sorted(entries & dates.keys(), key=lambda key: dates[key].stat().st_mtime_ns)
-            surplus |= set(by_use[: -_MAX_ENTRIES // 2])
-        if surplus:
-            # The lock of jax's own cache.
-            with FileLock(folder / ".lockfile", timeout=0):
-                for key in surplus:
-                    (folder / f"{key}-cache").unlink(missing_ok=True)
-                    (folder / f"{key}-atime").unlink(missing_ok=True)
-    except (OSError, Timeout):
-        return
-
-
-def _writable(folder: Path) -> bool:
+def _is_private(folder: Path) -> bool:
+    """True if ``folder`` is writable and belongs to this user: compiled code is executed, so no other one is trusted."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        # Compiled code is executed, so a folder of another user is not trusted.
-        if hasattr(os, "getuid") and folder.stat().st_uid != os.getuid():
-            return False
-        with tempfile.TemporaryFile(dir=folder):
-            return True
+        return os.access(folder, os.W_OK | os.X_OK) and folder.stat().st_uid == getattr(os, "getuid", lambda: 0)()
     except OSError:
         return False
+
+
+def _trim(folder: Path, most: int) -> None:
+    """Delete the oldest of too many files."""
+    with suppress(OSError):
+        files = [path for path in folder.iterdir() if path.is_file()]
+        for path in sorted(files, key=lambda path: path.stat().st_mtime)[:-most]:
+            path.unlink(missing_ok=True)
 
 
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "numpy", "scipy")
@@ -120,8 +101,8 @@ def numerics_of(system: type[System], analysis: Analysis, route: str) -> dict[st
     The code includes this package, and the packages of the system and of the analysis.
     """
     sources = dict(_own_sources())
-    for file in _files(system, analysis):
-        sources |= _sources_of(_package_of(file)) if file else {}
+    for package in _packages(system, analysis) - {drivetrain_jax.__name__}:
+        sources |= _sources_of(package)
     return {
         "route": route,
         "sources": sources,
@@ -138,20 +119,15 @@ def program_identity(system: type[System], analysis: Analysis, content: object) 
 
     Such code may depend on more than its files, such as the arguments of a script.
     """
-    own = system.__module__.startswith(f"{drivetrain_jax.__name__}.")
-    if not own or not all(file and _package_of(file) == _ROOT for file in _files(system, analysis)):
+    if _packages(system, analysis) != {drivetrain_jax.__name__}:
         return ""
     return digest([numerics_of(system, analysis, ""), system.name, analysis.name, drivetrain_jax.__version__, content])
 
 
-def _files(system: type[System], analysis: Analysis) -> list[Path | None]:
-    """Files of the code of a system and of an analysis."""
-    found: list[Path | None] = []
-    for function in (analysis.model(system).build, analysis.solvers):
-        # A partial, or a wrapper around a method, has no source of its own.
-        file = inspect.getsourcefile(inspect.unwrap(getattr(function, "func", function)))
-        found.append(Path(file) if file else None)
-    return found
+def _packages(system: type[System], analysis: Analysis) -> set[str]:
+    """Names of the outermost packages, or of the scripts, that contain the code of a system and of an analysis."""
+    code = (system, *(getattr(x, "func", x) for x in (analysis.model(system).build, analysis.solvers)))
+    return {str(x.__module__).partition(".")[0] for x in code}
 
 
 # Cached: later edits of the files do not change the imported code.
@@ -166,35 +142,58 @@ def _own_sources() -> dict[str, str]:
 
 
 @cache
-def _sources_of(package: Path) -> dict[str, str]:
-    """Digest of a package (a folder or one file) by its name; empty for this package."""
-    if package == _ROOT or not package.exists():
-        return {}
-    files = package.rglob("*.py") if package.is_dir() else [package]
-    return {package.name: source_digest({path.relative_to(package.parent).as_posix(): path for path in files})}
-
-
-def _package_of(path: Path) -> Path:
-    """The outermost package that contains a source file, or the file itself without one."""
-    while (path.parent / "__init__.py").is_file():
+def _sources_of(package: str) -> dict[str, str]:
+    """Digest of an imported package (a folder or one file) by its name; empty without files."""
+    module = sys.modules.get(package)
+    path = Path(getattr(module, "__file__", None) or "")
+    if hasattr(module, "__path__"):
         path = path.parent
-    return path
+    elif not path.is_file():
+        return {}
+    files = path.rglob("*.py") if path.is_dir() else [path]
+    return {path.name: source_digest({file.relative_to(path.parent).as_posix(): file for file in files})}
 
 
-# Number of files that are kept; one takes some 300 kB.
-_MOST, _DIGEST = 256, 16
-# Errors of a kernel that cannot be stored, or of a file that is missing, damaged or of no use here.
-_UNUSABLE = (OSError, ValueError, TypeError, KeyError, AttributeError, NotImplementedError, pickle.PickleError)
-_UNUSABLE += (jax.errors.JaxRuntimeError,)
+class Program:
+    """A function that is compiled with ``options`` of the compiler, once for all arguments of the same kinds.
+
+    ``identity`` is a digest of everything else that the program depends on. Its compiled code is kept on disk unless the
+    identity is empty.
+    """
+
+    def __init__(self, function: Callable[..., Any], options: Mapping[str, Any], identity: str) -> None:
+        self._function, self._options, self._identity = function, dict(options), identity
+        self._compiled: dict[Any, jax.stages.Compiled] = {}
+        self._lock = threading.Lock()
+
+    def __call__(self, *arguments: Any) -> Any:
+        """The results of the function."""
+        leaves, tree = jax.tree.flatten(arguments)
+        leaves = [x if isinstance(x, jax.Array) else np.asarray(x) for x in leaves]
+        kinds = (tree, *((x.shape, x.dtype.str) for x in leaves))
+        arguments = jax.tree.unflatten(tree, leaves)
+        with self._lock:
+            if kinds not in self._compiled:
+                identity = self._identity and digest([self._identity, str(kinds)])
+                self._compiled[kinds] = compiled(self._function, arguments, self._options, identity)
+        return self._compiled[kinds](*arguments)
+
+
+def kept(system: type[System], kernel: Any, options: Mapping[str, Any], name: str) -> Callable[..., Any]:
+    """``kernel``, a function of ``jax.jit``, as a :class:`Program` for all who ask; itself if it is not kept on disk."""
+    identity = program_identity(system, get_analysis("floquet").for_system(system), name) if programs() else ""
+    return _kept(kernel, tuple(options.items()), identity) if identity else kernel
+
+
+@lru_cache(maxsize=64)
+def _kept(kernel: Any, options: tuple[tuple[str, Any], ...], identity: str) -> Program:
+    return Program(kernel.__wrapped__, dict(options), identity)
 
 
 def compiled(
     function: Callable[..., Any], kinds: tuple[Any, ...], options: Mapping[str, Any], identity: str
 ) -> jax.stages.Compiled:
-    """``function`` compiled with ``options`` of the compiler for arguments of these ``kinds``.
-
-    ``identity`` is a digest of everything else that the kernel depends on; an empty one keeps nothing on disk.
-    """
+    """``function`` compiled for arguments of these ``kinds``; for ``options`` and ``identity`` see :class:`Program`."""
     name = digest([identity, dict(options)]) if identity and programs() else ""
     with suppress(*_UNUSABLE):
         has_lapack, *parts = _read(name)
@@ -213,57 +212,22 @@ def compiled(
     return kernel
 
 
-def kept(system: type[System], kernel: Any, options: Mapping[str, Any], name: str) -> Callable[..., Any]:
-    """``kernel``, a function of ``jax.jit`` with these ``options`` of the compiler, with its compiled code on disk.
-
-    Without a cache, and for a system of another package, it is ``kernel`` itself.
-    """
-    identity = program_identity(system, get_analysis("floquet").for_system(system), name) if programs() else ""
-    return _kept(kernel, tuple(options.items()), identity) if identity else kernel
-
-
-@lru_cache(maxsize=64)
-def _kept(kernel: Any, options: tuple[tuple[str, Any], ...], identity: str) -> Program:
-    return Program(kernel.__wrapped__, dict(options), identity)
-
-
-class Program:
-    """A function that is compiled by :func:`compiled`, once for all arguments of the same kinds."""
-
-    def __init__(self, function: Callable[..., Any], options: Mapping[str, Any], identity: str) -> None:
-        self._function, self._options, self._identity = function, options, identity
-        self._compiled: dict[Any, jax.stages.Compiled] = {}
-        self._lock = threading.Lock()
-
-    def __call__(self, *arguments: Any) -> Any:
-        """The results of the function."""
-        leaves, tree = jax.tree.flatten(arguments)
-        leaves = [x if isinstance(x, jax.Array) else np.asarray(x) for x in leaves]
-        kinds = (tree, *((x.shape, x.dtype.str) for x in leaves))
-        arguments = jax.tree.unflatten(tree, leaves)
-        with self._lock:
-            if kinds not in self._compiled:
-                identity = self._identity and digest([self._identity, str(kinds)])
-                self._compiled[kinds] = compiled(self._function, arguments, self._options, identity)
-        return self._compiled[kinds](*arguments)
-
-
 def calls(kernel: jax.stages.Compiled, target: str) -> bool:
     """True if ``kernel`` calls a library function whose name begins with ``target``."""
     return f'custom_call_target="{target}' in (kernel.as_text() or "")
 
 
 def remembered(compute: Callable[[], Any], identity: str) -> Any:
-    """``compute()``, stored on disk under ``identity``, as kernels are."""
+    """``compute()``, stored on disk under ``identity``, as programs are."""
     with suppress(*_UNUSABLE):
         return _read(identity)
-    found = compute()
-    _write(identity, found)
-    return found
+    content = compute()
+    _write(identity, content)
+    return content
 
 
 def _read(name: str) -> Any:
-    """A stored object; ``OSError`` or ``ValueError`` if there is none, or a damaged one.
+    """A stored object; one of ``_UNUSABLE`` if there is none, or a damaged one.
 
     The folder belongs to the user alone, and what it holds is executed anyway.
     """
@@ -278,14 +242,12 @@ def _read(name: str) -> Any:
 
 
 def _write(name: str, content: Any) -> None:
-    """Store an object, and delete those that have not been used for the longest time. A full disk is no error."""
+    """Store an object. A full disk is no error."""
     folder = programs()
-    if not name or folder is None:
-        return
-    with suppress(OSError):
-        folder.mkdir(mode=0o700, exist_ok=True)
-        data = zlib.compress(pickle.dumps(content), 1)
-        data = hashlib.blake2b(data, digest_size=_DIGEST).digest() + data
-        write_atomic(folder / name, data, folder / f"{name}.{os.getpid()}.tmp")
-        for file in sorted(folder.iterdir(), key=lambda file: file.stat().st_mtime)[:-_MOST]:
-            file.unlink(missing_ok=True)
+    if name and folder is not None:
+        with suppress(OSError):
+            folder.mkdir(mode=0o700, exist_ok=True)
+            data = zlib.compress(pickle.dumps(content), 1)
+            data = hashlib.blake2b(data, digest_size=_DIGEST).digest() + data
+            write_atomic(folder / name, data, folder / f"{name}.{os.getpid()}.tmp")
+            _trim(folder, _PROGRAMS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import pickle
 import shutil
 from pathlib import Path
@@ -111,17 +112,18 @@ def test_a_changed_file_changes_the_digest_and_a_figure_does_not(monkeypatch, tm
     assert {name for name in before if changed[name] != before[name]} == {"analysis/floquet"}
 
 
-def test_the_whole_package_of_an_external_system_changes_the_digest(tmp_path):
-    package = tmp_path / "gears"
+def test_the_whole_package_of_an_external_system_changes_the_digest(tmp_path, monkeypatch):
+    package = tmp_path / "gears_of_a_test"
     (package / "laws").mkdir(parents=True)
     for name in ("__init__.py", "shaft.py", "laws/__init__.py", "laws/stiffness.py"):
         (package / name).write_text("")
-    assert _programs._package_of(package / "laws" / "stiffness.py") == package
-    before = _programs._sources_of(package)
-    assert list(before) == ["gears"]
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.import_module("gears_of_a_test.shaft")
+    before = _programs._sources_of(package.name)
+    assert list(before) == [package.name]
     (package / "laws" / "stiffness.py").write_text("K = 1")
     _programs._sources_of.cache_clear()
-    assert _programs._sources_of(package) != before
+    assert _programs._sources_of(package.name) != before
 
 
 def test_the_route_changes_the_digest():
