@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._errors import ChunkError, InputError
-from drivetrain_jax._precision import use_double_precision
+from drivetrain_jax._machine import use_double_precision
 
 if TYPE_CHECKING:
     from drivetrain_jax.analyses import (

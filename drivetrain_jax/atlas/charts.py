@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._machine import usable_cores
-from drivetrain_jax._threads import threads
+from drivetrain_jax._machine import threads, usable_cores
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.floquet import quartic
 from drivetrain_jax.analysis.floquet.quartic import EPS, Blocks, determinant, square_norm, transposed_product

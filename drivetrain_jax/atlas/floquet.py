@@ -13,8 +13,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._machine import usable_cores
-from drivetrain_jax._threads import threads
+from drivetrain_jax._machine import threads, usable_cores
 from drivetrain_jax.analysis.floquet.effort import stable_steps, steps_needed
 from drivetrain_jax.analysis.floquet.power_series import propagators_along
 from drivetrain_jax.analysis.numerics.kernels import Words, compiler_options, predicted, split

@@ -16,9 +16,7 @@ import numpy as np
 
 from drivetrain_jax import _programs
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
-from drivetrain_jax._machine import usable_cores
-from drivetrain_jax._precision import use_double_precision
-from drivetrain_jax._threads import in_double_precision, threads
+from drivetrain_jax._machine import in_double_precision, threads, usable_cores, use_double_precision
 from drivetrain_jax.analysis import Solver
 from drivetrain_jax.runs.assemble import dimension_sizes, missing_value
 from drivetrain_jax.runs.axes import Grid

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from drivetrain_jax._threads import in_double_precision
+from drivetrain_jax._machine import in_double_precision
 from drivetrain_jax._wording import counted
 from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request
 from drivetrain_jax.analysis.atlas.analysis import SOLVES

@@ -19,9 +19,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
-from drivetrain_jax._machine import usable_cores
+from drivetrain_jax._machine import threads, usable_cores
 from drivetrain_jax._quantities import FIRST_FAILURE
-from drivetrain_jax._threads import threads
 from drivetrain_jax._wording import shown
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import ResultBuffer, labelled

@@ -12,7 +12,7 @@ from interrupts import stop_after
 
 import drivetrain_jax as dt
 from drivetrain_jax import InputError
-from drivetrain_jax._threads import threads
+from drivetrain_jax._machine import threads
 from drivetrain_jax.cli import main
 from drivetrain_jax.invariants import verify
 from drivetrain_jax.runs import stores, toml
