@@ -75,7 +75,7 @@ def threads(count: int, name: str) -> ThreadPoolExecutor:
 
 
 def in_double_precision() -> None:
-    """Turn on double precision in this thread; contexts of the caller, which has imported jax, do not reach other threads."""
+    """Turn on double precision in this thread; contexts of the caller do not reach other threads."""
     sys.modules["jax"].enable_x64(True).__enter__()
 
 

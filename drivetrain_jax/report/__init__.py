@@ -98,7 +98,7 @@ def _section(path: Path, number: int, asked: list[str], amplitude: Any) -> dict[
     else:
         chart, compared = dataset.load(), False
     if amplitude is not None and (analysis == "floquet" or amplitudes(chart)):
-        from drivetrain_jax.runs.forced_limit import Limit
+        from drivetrain_jax.runs.reply import Limit
         from drivetrain_jax.runs.scene import find_system
 
         system = find_system(str(attrs.get("system")))

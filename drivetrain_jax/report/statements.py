@@ -20,7 +20,7 @@ from drivetrain_jax.view.style import in_brackets, scene_key, units_of
 from drivetrain_jax.view.units import ASKED, size, suitable, unit_of, value_in, written_units
 
 if TYPE_CHECKING:
-    from drivetrain_jax.runs.forced_limit import Limit
+    from drivetrain_jax.runs.reply import Limit
 
 # Largest number of intervals and of labels that a statement lists.
 _MOST = 8

@@ -22,10 +22,18 @@ from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.windows import Crossing, Interval, narrow
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, check_same
-from drivetrain_jax.runs.forced_limit import forced_at, forced_over
 from drivetrain_jax.runs.physical import GivenData, in_parameters
-from drivetrain_jax.runs.reply import Reply, growth_at, growth_lines
-from drivetrain_jax.runs.sensitivities import gradient_lines, limit_line, radius_gradient, radius_sensitivities
+from drivetrain_jax.runs.reply import (
+    Reply,
+    forced_at,
+    forced_over,
+    gradient_lines,
+    growth_at,
+    growth_lines,
+    limit_line,
+    radius_gradient,
+    radius_sensitivities,
+)
 
 # Distance of a spectral radius from 1 below which the distance itself is printed.
 _CLOSE = 1e-3

@@ -19,8 +19,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import PENDING, ResultBuffer, labelled, misfits, with_pending
 from drivetrain_jax.runs.identity import differences
-from drivetrain_jax.runs.job import Job, Results
-from drivetrain_jax.runs.resolve import resolve
+from drivetrain_jax.runs.job import Job, Results, resolve
 from drivetrain_jax.runs.reuse import NO_REUSE, Damaged, NotReusable, ReusableResult, ReusedPoints, combined, find
 from drivetrain_jax.runs.scene import load_scene, restore_scene
 from drivetrain_jax.runs.stores import BlockStore, ZarrBlocks, stored_blocks

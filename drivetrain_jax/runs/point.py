@@ -16,11 +16,9 @@ from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, get_
 from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range, orders_of
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
-from drivetrain_jax.runs.forced_limit import Limit
-from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.job import Job, resolve
 from drivetrain_jax.runs.physical import described
-from drivetrain_jax.runs.reply import Reply, growth_lines, growth_of, speed_in_rpm
-from drivetrain_jax.runs.resolve import resolve
+from drivetrain_jax.runs.reply import Limit, Reply, growth_lines, growth_of, speed_in_rpm
 from drivetrain_jax.runs.scene import Scene, load_scene, system_and_analysis
 
 
@@ -221,7 +219,7 @@ def point(
     found = _result(job, _compute(job))
     if sensitivities:
         # Local import: a point without sensitivities needs no atlas.
-        from drivetrain_jax.runs.sensitivities import gradient_lines, point_sensitivities
+        from drivetrain_jax.runs.reply import gradient_lines, point_sensitivities
 
         data = {name: value for name, (value, _) in found.physical.items()}
         effects = point_sensitivities(job.scene.system, found.parameters, data) if found.outcome.has_value else None

@@ -1,19 +1,37 @@
-"""An answer of a point or an atlas as text, as JSON and as sentences of a report; growth of disturbances in its words."""
+"""An answer of a point or an atlas as text, as JSON and as sentences of a report.
+
+Its parts: growth of disturbances, sensitivities to every parameter or physical datum (largest effect first), and the
+amplitude of the forced motion against a limit, at a point and along the speeds of a design answer.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import jax
 import numpy as np
 
 from drivetrain_jax import _units
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._programs import compiled, program_identity
+from drivetrain_jax._quantities import Parameter
+from drivetrain_jax._wording import shown
+from drivetrain_jax.analysis import get_analysis
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
+from drivetrain_jax.analysis.numerics.kernels import options_for_few
+from drivetrain_jax.analysis.numerics.lanes import Constants
+from drivetrain_jax.analysis.request import checked, make_request
+from drivetrain_jax.runs.physical import GivenData, described
+from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.systems import System
 
 if TYPE_CHECKING:
+    from drivetrain_jax.atlas.windows import Crossing
     from drivetrain_jax.runs.atlas_answers import AtlasQuery
 
 
@@ -141,3 +159,331 @@ def growth_lines(found: Mapping[str, float], width: int = 24, sign: str = "= ") 
     return [
         f"  {word:<{width}} {sign}{', '.join(filter(None, (rate, per_turn)))}{f'; {way}s in {ends}' if ends else ''}"
     ]
+
+
+# Relative step of central differences of the conversions of physical data, and step at 0. Part of the largest effect below
+# which an effect is rounding.
+_STEP, _ROUNDING = 1e-5, 1e-9
+
+
+class Sensitivity(NamedTuple):
+    """The ``slope`` of an answer by the datum ``name`` in its ``units``, and its change for one more ``percent``."""
+
+    name: str
+    units: str
+    slope: float
+    percent: float
+
+
+def radius_sensitivities(asked: AtlasQuery, slopes: Mapping[str, float]) -> list[Sensitivity]:
+    """Sensitivities of the spectral radius at the point of a question; ``slopes`` is its gradient by the parameters."""
+    point = {**asked.atlas.fixed, **asked.values}
+    return _of_radius(asked.atlas.scene.system, asked.shaft, point, slopes)
+
+
+def point_sensitivities(
+    system: type[System], point: Mapping[str, Any], physical: Mapping[str, Any]
+) -> list[Sensitivity] | None:
+    """Sensitivities of the spectral radius at a ``point`` (parameters) that follows from ``physical`` data, if any; None
+    without a gradient. Raises :class:`InputError` for a system without a spectral radius."""
+    if "floquet" not in system.models:
+        raise InputError(f"sensitivities: {system.name} has no spectral radius; allowed for floquet")
+    slopes = radius_gradient(system, point)
+    shaft = GivenData(system.physical, physical) if physical and system.physical else None
+    return None if slopes is None else _of_radius(system, shaft, point, slopes)
+
+
+def _of_radius(
+    system: type[System], shaft: GivenData | None, point: Mapping[str, Any], slopes: Mapping[str, float]
+) -> list[Sensitivity]:
+    def change(changes: Mapping[str, float], _: Any) -> float:
+        return sum(slopes[name] * x for name, x in changes.items() if name in slopes)
+
+    return _of_data(system, shaft, point, "", change)
+
+
+def limit_sensitivities(asked: AtlasQuery, parameter: str, limit: Crossing) -> list[Sensitivity]:
+    """Sensitivities of a limit of ``parameter``, in physical units if its data are known; empty without a gradient.
+
+    On the limit the spectral radius is 1, so ``d parameter/dp = -(d rho/dp)/(d rho/d parameter)``.
+    """
+    point = {**asked.atlas.fixed, **asked.numbers(), **limit.point, parameter: limit.value}
+    slopes = radius_gradient(asked.atlas.scene.system, point)
+    if slopes is None or slopes[parameter] == 0:
+        return []
+    turned = {name: -slope / slopes[parameter] for name, slope in slopes.items() if name != parameter}
+
+    def limit_at(changes: Mapping[str, float], data: Mapping[str, Any]) -> float:
+        value = limit.value + sum(turned[n] * x for n, x in changes.items() if n in turned)
+        back = asked.shaft.physical.back(parameter, data) if asked.shaft else None
+        return float(back[1](value)) if back else value
+
+    return _of_data(asked.atlas.scene.system, asked.shaft, point, parameter, limit_at)
+
+
+def _of_data(
+    system: type[System],
+    shaft: GivenData | None,
+    point: Mapping[str, float],
+    without: str,
+    answer: Callable[[dict[str, float], Any], float],
+) -> list[Sensitivity]:
+    """Sensitivities of ``answer(changes of the parameters, data)`` by the physical data, and by parameters without such.
+
+    The quantity behind the parameter ``without`` is no datum, because it is the answer.
+    """
+    data: dict[str, Any] = {name: value for name, value in point.items() if name != without}
+    if shaft:
+        follow = {each.parameter: each.needs for each in shaft.physical.conversions}
+        own = {name: shaft.quantity(name, value) for name, value in point.items()}
+        ends = {known[0]: known[1] for name, known in own.items() if known and name != without}
+        given = {name: x for name, x in shaft.data.items() if name in shaft.physical.names and _is_number(x)}
+        given = {**given, **ends}
+        given.pop(follow[without][0] if without in follow else "", None)
+        known = {name for name, needs in follow.items() if set(needs) <= given.keys()}
+        used = {need for name in known for need in follow[name]}
+        data = {name: x for name, x in given.items() if name in used} | {
+            name: value for name, value in data.items() if name not in known
+        }
+
+    def at(data: Mapping[str, Any]) -> float:
+        converted = shaft.physical.converted(data) if shaft else {}
+        parameters = {**data, **converted}
+        return answer({name: parameters[name] - x for name, x in point.items() if name in parameters}, data)
+
+    names, found = described(system), []
+    for name, value in data.items():
+        if names[name].integer:
+            continue
+        step = _STEP * abs(value) or _STEP
+        slope = (at({**data, name: value + step}) - at({**data, name: value - step})) / (2 * step)
+        found.append(Sensitivity(name, names[name].units, slope, slope * value / 100))
+    return sorted(found, key=lambda each: -abs(each.percent))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def gradient_lines(found: list[Sensitivity] | None) -> list[str]:
+    """The sensitivities of the spectral radius as text."""
+    if found is None:
+        return [
+            "gradient of spectral_radius",
+            "  none: two multipliers have the largest modulus, within the errors, or it cannot be computed",
+        ]
+    return [
+        "gradient of spectral_radius, largest effect of 1 % first",
+        *(
+            f"  {each.name:<24} {each.percent:+.6g} for +1 %, {each.slope:.6g}"
+            f"{'' if each.units == '1' else f' per {each.units}'}"
+            for each in found
+        ),
+    ]
+
+
+def limit_line(asked: AtlasQuery, parameter: str, limit: Crossing | None, before: str = "") -> tuple[str, list[Any]]:
+    """The sensitivities of a limit as a line of text and as data; empty without any."""
+    found = limit_sensitivities(asked, parameter, limit) if limit else []
+    if limit is None or not found:
+        return "", []
+    physical = asked.shaft.quantity(parameter, limit.value) if asked.shaft else None
+    name, _, units = physical or (parameter, 0.0, asked.atlas.scene.system.parameter(parameter).units)
+    least = _ROUNDING * abs(found[0].percent)
+    changes = ", ".join(f"{each.name} {each.percent:+.3g}" for each in found if abs(each.percent) > least)
+    unit = "" if units == "1" else f" [{units}]"
+    return f"{before}+1 % of a value changes {name} by{unit}: {changes}", [x._asdict() for x in found]
+
+
+def radius_gradient(system: type[System], values: Mapping[str, float]) -> dict[str, float] | None:
+    """Derivatives of the spectral radius by all parameters of ``system`` at ``values``, integers apart; None without any."""
+    names = system.models["floquet"].parameters
+    found = np.asarray(_compiled_gradient(system, names)({name: np.float64(values[name]) for name in names}))
+    # JAX orders the leaves of a dictionary by key.
+    slopes = dict(zip(sorted(names), map(float, found), strict=True))
+    real = [name for name in names if not system.parameter(name).integer]
+    return {name: slopes[name] for name in real} if np.isfinite([slopes[name] for name in real]).all() else None
+
+
+@lru_cache(maxsize=8)
+def _compiled_gradient(system: type[System], names: tuple[str, ...]) -> Callable[[dict[str, float]], jax.Array]:
+    """The derivative rule of :func:`~drivetrain_jax.floquet` alone: tracing the value as well takes twice the time."""
+    analysis = get_analysis("floquet").for_system(system)
+    request = make_request(system, analysis, ["spectral_radius"], {})
+
+    def slopes(parameters: dict[str, jax.Array]) -> jax.Array:
+        assert analysis.derivatives is not None
+        constants = Constants(dict.fromkeys(names))
+        return analysis.derivatives(system, request, parameters, constants, {})["spectral_radius"]
+
+    kinds = ({name: np.float64(0.0) for name in names},)
+    identity = program_identity(system, analysis, "gradient") if find_system(system.name) is system else ""
+    return compiled(slopes, kinds, options_for_few(), identity)
+
+
+# Samples of a range of speeds: evenly spaced, and halving distances from both ends, where a resonance may lie.
+_EVEN, _HALVINGS = 91, range(8, 22)
+# Points and rounds by which peaks and crossings of the limit are refined.
+_PARTS, _PEAK_ROUNDS, _LIMIT_ROUNDS = 9, 2, 3
+
+
+@dataclass(frozen=True)
+class Limit:
+    """A largest allowed amplitude in the unit of the displacements, and the unit of its answers."""
+
+    value: float
+    units: str
+    names: tuple[str, ...]
+    own: str
+
+    @classmethod
+    def of(cls, system: type[System], given: Any) -> Limit:
+        """The checked limit; :class:`InputError` for a system without a forced response."""
+        if "forced" not in system.models or system.displacements is None:
+            raise InputError(
+                f"amplitude = {shown(given)}: {system.name} has no forced response; allowed for a system that has one"
+            )
+        own = system.state[0].units
+        largest = math.pi / 2 if own == "rad" else math.inf
+        parameter = Parameter("amplitude", own, "limit", lower=0.0, open_lower=True, upper=largest)
+        parts = _units.split(given) if isinstance(given, str) else None
+        if parts and not parts[1]:
+            given = parts[0]
+        value = float(checked(parameter, given, ""))
+        names = tuple(map(str, system.displacements.values))
+        return cls(value, parts[1] if parts and parts[1] else own, names, own)
+
+    def written(self, amplitude: float) -> str:
+        """An amplitude as text, in the unit of the limit."""
+        return f"{amplitude * _units.factor(self.own, self.units):.6g} {self.units}"
+
+    def at_point(self, amplitudes: np.ndarray, verdict: int) -> tuple[str, dict[str, Any]]:
+        """The amplitudes at one point with this verdict, and whether they are within the limit: text and data.
+
+        ``within`` is None if that is undecided.
+        """
+        known, unstable, undecided = bool(np.all(np.isfinite(amplitudes))), verdict == 1, verdict == 2
+        above = known and bool(np.max(amplitudes) > self.value)
+        within = None if not known or (undecided and not above) else not (above or unstable)
+        names = self.names or tuple(map(str, range(1, len(amplitudes) + 1)))
+        each = ", ".join(f"{name} {self.written(a)}" for name, a in zip(names, amplitudes, strict=True))
+        compared = "unstable: the motion grows beyond" if unstable else "above" if above else "within"
+        doubt = " if the motion is stable, which is undecided" if within is None else ""
+        values = [float(a) if np.isfinite(a) else None for a in amplitudes]
+        text = f"{each}; {compared} the limit of {self.written(self.value)}{doubt}" if known else "no value"
+        return text, {
+            "amplitude": dict(zip(names, values, strict=True)),
+            "limit": self.value,
+            "units": self.own,
+            "within": within,
+        }
+
+    def along(
+        self, amplitude: Callable[[np.ndarray], np.ndarray], low: float, high: float, likely: np.ndarray
+    ) -> Along:
+        """The amplitudes along the speeds from ``low`` to ``high``; ``amplitude`` returns those of all displacements.
+
+        ``likely`` are speeds near peaks, which may be narrower than the distance of the samples.
+        """
+        steps = (high - low) * 0.5 ** np.array(_HALVINGS)
+        likely = likely[(likely > low) & (likely < high)]
+        x = np.unique(np.concatenate([np.linspace(low, high, _EVEN), low + steps, high - steps, likely]))
+        y = amplitude(x)
+        for _ in range(_PEAK_ROUNDS):
+            size = np.max(y, axis=1)
+            peaks = np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] >= size[2:])) + 1
+            x, y = _refined(amplitude, x, y, [(x[k - 1], x[k + 1]) for k in peaks])
+        for _ in range(_LIMIT_ROUNDS):
+            inside = np.max(y, axis=1) <= self.value
+            x, y = _refined(amplitude, x, y, [(x[k], x[k + 1]) for k in np.flatnonzero(inside[1:] != inside[:-1])])
+        size = np.max(y, axis=1)
+        k = int(np.argmax(size))
+        edges = np.flatnonzero(np.diff(np.concatenate(([0], (size <= self.value).astype(np.int8), [0]))))
+        ranges = tuple((float(x[a]), float(x[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True))
+        return Along(self, float(size[k]), float(x[k]), self.names[int(np.argmax(y[k]))], ranges)
+
+
+def _refined(
+    amplitude: Callable[[np.ndarray], np.ndarray], x: np.ndarray, y: np.ndarray, between: list[tuple[float, float]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Samples with more of them ``between`` these pairs of speeds."""
+    if not between:
+        return x, y
+    new = np.setdiff1d(np.concatenate([np.linspace(a, b, _PARTS) for a, b in between]), x)
+    if not new.size:
+        return x, y
+    x, y = np.concatenate([x, new]), np.concatenate([y, amplitude(new)])
+    order = np.argsort(x)
+    return x[order], y[order]
+
+
+@dataclass(frozen=True)
+class Along:
+    """The ``largest`` amplitude of a range of speeds, that of the displacement ``name`` at ``where``, and the ranges of
+    speed ``within`` the limit."""
+
+    limit: Limit
+    largest: float
+    where: float
+    name: str
+    within: tuple[tuple[float, float], ...]
+
+    def text(self, named: Callable[[float], str]) -> str:
+        """The amplitudes as text; ``named`` writes a speed."""
+        most = f"at most {self.limit.written(self.largest)} ({self.name} at {named(self.where)})"
+        if self.largest <= self.limit.value:
+            return f"forced amplitude {most}: within the limit of {self.limit.written(self.limit.value)}"
+        ranges = ", ".join(f"{named(a)} to {named(b)}" for a, b in self.within)
+        kept = f"within the limit from {ranges}" if ranges else "above it at all of these speeds"
+        return f"forced amplitude {most}: above the limit of {self.limit.written(self.limit.value)}; {kept}"
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """The amplitudes as plain numbers."""
+        return {
+            "limit": self.limit.value,
+            "units": self.limit.own,
+            "largest": self.largest,
+            "where": self.where,
+            "displacement": self.name,
+            "within": [list(each) for each in self.within],
+        }
+
+
+def forced_along(atlas: Any, limit: Limit, ends: tuple[float, float], at: Mapping[str, float]) -> Along:
+    """The amplitudes of a stored atlas along its speed, with the other parameters ``at``; no value counts as infinite."""
+    system = atlas.scene.system
+    speed, predicted = system.roles["speed"], system.resonances
+
+    def amplitude(speeds: np.ndarray) -> np.ndarray:
+        columns = {name: np.full(speeds.size, at[name]) for name in atlas.parameters if name != speed}
+        return np.nan_to_num(atlas.amplitude({**columns, speed: speeds}), nan=np.inf)
+
+    likely = np.empty(0)
+    if predicted and predicted.axis == speed:
+        forced = tuple(family.prefix for family in predicted.families if family.forced)
+        excited = [bool(forced) and label.startswith(forced) for label in predicted.labels]
+        likely = np.asarray(predicted.values({**atlas.fixed, **at}), float)[np.array(excited)]
+    return limit.along(amplitude, *ends, likely)
+
+
+def forced_at(atlas: Any, amplitude: Any, point: Mapping[str, float], verdict: Any) -> tuple[list[str], dict[str, Any]]:
+    """The comparison of a stored atlas with a limit at one ``point``, as lines and as data; empty without a limit."""
+    if amplitude is None:
+        return [], {}
+    limit = Limit.of(atlas.scene.system, amplitude)
+    columns = {name: np.array([value]) for name, value in point.items()}
+    verdict = atlas.direct(columns, "verdict")[0] if verdict is None else verdict
+    text, data = limit.at_point(atlas.amplitude(columns)[0], int(verdict))
+    return [f"forced amplitude: {text}"], {"forced": data}
+
+
+def forced_over(
+    atlas: Any, amplitude: Any, ranges: list[Any], at: Mapping[str, float], named: Callable[[str, float], str]
+) -> tuple[list[list[str]], dict[str, Any]]:
+    """The comparison with a limit in ``ranges`` of speed: lines for each, and data; no lines without a limit."""
+    if amplitude is None:
+        return [[] for _ in ranges], {}
+    limit, speed = Limit.of(atlas.scene.system, amplitude), atlas.scene.system.roles["speed"]
+    found = [forced_along(atlas, limit, ends, at) for ends in ranges]
+    return [[each.text(lambda x: named(speed, x))] for each in found], {"forced": [each.data for each in found]}

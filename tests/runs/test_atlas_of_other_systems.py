@@ -14,7 +14,7 @@ import drivetrain_jax as dt
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.runs import resolve as resolve_module
 from drivetrain_jax.runs import scene
-from drivetrain_jax.runs.resolve import choose_atlas
+from drivetrain_jax.runs.job import choose_atlas
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System, parameter, serves
 

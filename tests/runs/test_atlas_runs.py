@@ -22,8 +22,7 @@ from drivetrain_jax.cli import main
 from drivetrain_jax.runs import atlas_answers, atlas_chart, through_atlas
 from drivetrain_jax.runs import resolve as resolve_module
 from drivetrain_jax.runs.atlas_chart import chart
-from drivetrain_jax.runs.job import Job
-from drivetrain_jax.runs.resolve import choose_atlas
+from drivetrain_jax.runs.job import Job, choose_atlas
 from drivetrain_jax.runs.run import Incomplete, Interrupted, run_to_file
 from drivetrain_jax.runs.scene import load_scene
 from tests.atlases import atlas_file

@@ -11,7 +11,7 @@ import pytest
 import drivetrain_jax as dt
 from drivetrain_jax.cli import main
 from drivetrain_jax.runs import atlas_answers
-from drivetrain_jax.runs.forced_limit import Limit
+from drivetrain_jax.runs.reply import Limit
 from tests.atlases import stored_atlas
 
 DATA = {"J1": 2.0, "J2": 0.5, "k1": 6e4, "k2": 4e4, "c1": 0.3464, "c2": 0.1414, "angle": "12 deg"}
