@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import xarray as xr
 
-from drivetrain_jax.store.netcdf import Entry, Labelled
+from drivetrain_jax.store.consolidate import Entry, Labelled
 
 
 def labelled(dataset: xr.Dataset) -> Labelled:

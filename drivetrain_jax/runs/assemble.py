@@ -17,9 +17,8 @@ from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.scene import Problem, Scene, result_variables
-from drivetrain_jax.store.consolidate import release
+from drivetrain_jax.store.consolidate import CONVENTIONS, Coordinate, Labelled, release
 from drivetrain_jax.store.files import command, now, versions
-from drivetrain_jax.store.netcdf import CONVENTIONS, Coordinate, Labelled
 from drivetrain_jax.systems import System
 
 if TYPE_CHECKING:

@@ -28,9 +28,8 @@ from drivetrain_jax.runs.scene import Scene, atlas_ranges, restore_scene
 from drivetrain_jax.runs.through_atlas import build_atlas, evaluate
 from drivetrain_jax.runs.work import DIRECT, Progress, Route, Threads, Work
 from drivetrain_jax.store import checksums
-from drivetrain_jax.store.consolidate import open_result, read_plain, write_result
+from drivetrain_jax.store.consolidate import Entry, Labelled, open_result, read_plain, write_result
 from drivetrain_jax.store.files import ATLAS_PREFACE
-from drivetrain_jax.store.netcdf import Entry, Labelled
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
+import drivetrain_jax
 from drivetrain_jax import _programs
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax._machine import in_double_precision, threads, usable_cores, use_double_precision
@@ -21,7 +22,6 @@ from drivetrain_jax.analysis import Solver
 from drivetrain_jax.analysis.atlas.analysis import ANALYSIS
 from drivetrain_jax.runs.assemble import dimension_sizes, missing_value
 from drivetrain_jax.runs.axes import MAX_RANGES, Grid
-from drivetrain_jax.runs.identity import scene_digest
 from drivetrain_jax.runs.kernel import FEW, LIGHT, Kernel, for_device, kernel_of
 from drivetrain_jax.runs.scene import Problem, Ranges, Scene, atlas_ranges, result_variables
 from drivetrain_jax.store.files import digest
@@ -403,3 +403,34 @@ def _affordable_solves(scene: Scene, grid: Grid, ranges: Ranges) -> int:
     node = mean_cost(nodes.solvers, nodes.grid, np.arange(_RANDOM))
     # Nodes of cost 0 are nodes that no solver can compute.
     return int(grid.size * _SHARE * point / node) if node else 0
+
+
+def scene_content(scene: Problem) -> dict[str, Any]:
+    """The content of a scene without its title."""
+    request = scene.request
+    return {
+        "system": scene.system.name,
+        "analysis": scene.analysis.name,
+        "outputs": request.outputs,
+        "method": request.method,
+        "options": dict(request.options),
+        "axes": [
+            [part.name, part.parameter.units, part.values]
+            for axis in scene.axes
+            for part in (*axis.given, *axis.together)
+        ],
+        "zipped": scene.zipped,
+        "fixed": dict(scene.fixed),
+    }
+
+
+def scene_digest(scene: Problem, solvers: Sequence[Solver], numerics: str) -> str:
+    """Digest of scene (without title), chunk sizes, package version and numerics."""
+    return digest(
+        scene_content(scene)
+        | {
+            "solvers": [[solver.name, solver.chunk, solver.unit_cost] for solver in solvers],
+            "version": drivetrain_jax.__version__,
+            "numerics": numerics,
+        }
+    )

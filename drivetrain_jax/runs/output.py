@@ -18,14 +18,22 @@ import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import PENDING, ResultBuffer, labelled, misfits, with_pending
-from drivetrain_jax.runs.identity import differences
 from drivetrain_jax.runs.job import Job, Results, resolve
-from drivetrain_jax.runs.reuse import NO_REUSE, Damaged, NotReusable, ReusableResult, ReusedPoints, combined, find
+from drivetrain_jax.runs.reuse import (
+    NO_REUSE,
+    Damaged,
+    NotReusable,
+    ReusableResult,
+    ReusedPoints,
+    combined,
+    differences,
+    find,
+)
 from drivetrain_jax.runs.scene import load_scene, restore_scene
 from drivetrain_jax.runs.stores import BlockStore, ZarrBlocks, stored_blocks
 from drivetrain_jax.store import checksums, consolidate, zarr_store
+from drivetrain_jax.store.checksums import opened
 from drivetrain_jax.store.files import behind_link
-from drivetrain_jax.store.netcdf import opened
 from drivetrain_jax.store.parts import PartsFolder
 
 if TYPE_CHECKING:

@@ -19,9 +19,8 @@ from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.job import Block, Job, Results
 from drivetrain_jax.runs.scene import restore_scene, result_variables
 from drivetrain_jax.store import checksums, zarr_store
-from drivetrain_jax.store.consolidate import ResultFile, read_attribute, release
+from drivetrain_jax.store.consolidate import Labelled, ResultFile, read_attribute, release
 from drivetrain_jax.store.files import flush_tree, move_folder
-from drivetrain_jax.store.netcdf import Labelled
 from drivetrain_jax.store.parts import PartsFolder
 
 

@@ -27,8 +27,7 @@ from drivetrain_jax.runs.assemble import ResultBuffer, labelled
 from drivetrain_jax.runs.job import Block, Chunk, Job, Results
 from drivetrain_jax.runs.reuse import NO_REUSE, ReusedPoints
 from drivetrain_jax.runs.stores import BlockStore, stored_blocks
-from drivetrain_jax.store.consolidate import ResultFile
-from drivetrain_jax.store.netcdf import Labelled
+from drivetrain_jax.store.consolidate import Labelled, ResultFile
 
 # Most threads or processes, unless four a core are more.
 _MOST = 64

@@ -1,4 +1,4 @@
-"""Checksums of a finished result: of each variable as a reader sees it, and of the attributes of the file.
+"""Open HDF5 files, and compare checksums of a finished result: of each variable, and of the attributes of the file.
 
 The checksums are computed once, when the file is complete. HDF5's own filter (fletcher32) needs chunked storage, which
 cannot be memory-mapped, and does not cover attributes and labels.
@@ -10,6 +10,7 @@ import hashlib
 import json
 from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,6 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._machine import usable_cores
-from drivetrain_jax.store.netcdf import opened
 
 ATTRIBUTE = "checksums"
 # The name of the root group stands for the attributes of the file.
@@ -28,6 +28,37 @@ _BLOCK = 1 << 24
 _LARGE = 1 << 22
 # Attributes by which the netCDF library links dimensions and variables; the links are checked by name.
 _LINKS = frozenset({"DIMENSION_LIST", "REFERENCE_LIST", "CLASS", "NAME", "_Netcdf4Dimid", "_Netcdf4Coordinates"})
+
+
+# Exceptions of h5py for a damaged file structure.
+BROKEN = (OSError, KeyError, ValueError, RuntimeError, TypeError, OverflowError, MemoryError)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[h5py.File]:
+    """The HDF5 file at ``path``. Damage raises :class:`InputError`, found at the start or inside the context."""
+    if not path.is_file():
+        raise unreadable(path)
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except BlockingIOError:
+        message = f"file = {str(path)!r}: locked by another program; wait until that program closes it"
+        raise InputError(message) from None
+    except BROKEN as error:
+        raise unreadable(path) from error
+
+
+def unreadable(path: Path) -> InputError:
+    """The error for a path that is not a readable file."""
+    if path.suffix == ".parts":
+        return InputError(f"file = {str(path)!r}: a folder of unfinished work; give {str(path.with_suffix(''))!r}")
+    if (path / "zarr.json").is_file():
+        return InputError(f"file = {str(path)!r}: a Zarr store; give the file that `drivetrain export` makes of it")
+    what = (
+        "not a readable netCDF4/HDF5 file" if path.is_file() else "is a folder" if path.is_dir() else "does not exist"
+    )
+    return InputError(f"file = {str(path)!r}: {what}; give a result written by `drivetrain run`")
 
 
 def reserve(file: h5py.File) -> None:

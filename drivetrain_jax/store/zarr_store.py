@@ -19,8 +19,8 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import counted
+from drivetrain_jax.store.consolidate import DETAILS, GROUP, Labelled
 from drivetrain_jax.store.files import digest, flush, sync_folder
-from drivetrain_jax.store.netcdf import DETAILS, GROUP, Labelled
 from drivetrain_jax.store.parts import Place, Shards
 
 # Folder among the parts in which a store grows, and the one for a store while another one replaces it.

@@ -10,8 +10,7 @@ import xarray as xr
 from drivetrain_jax import InputError
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.store import checksums
-from drivetrain_jax.store.consolidate import open_result, write_result
-from drivetrain_jax.store.netcdf import Coordinate, Labelled
+from drivetrain_jax.store.consolidate import Coordinate, Labelled, open_result, write_result
 from tests.sizes import full_after
 
 

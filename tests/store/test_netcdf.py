@@ -9,8 +9,7 @@ import pytest
 import xarray as xr
 
 from drivetrain_jax._quantities import Dimension, Variable
-from drivetrain_jax.store.consolidate import write_result
-from drivetrain_jax.store.netcdf import Coordinate, Labelled
+from drivetrain_jax.store.consolidate import Coordinate, Labelled, write_result
 
 OWN = {"_NCProperties", "checksums"}
 

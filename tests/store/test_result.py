@@ -16,8 +16,15 @@ from drivetrain_jax import InputError
 from drivetrain_jax._machine import machine, physical_memory, usable_cores
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.store import files
-from drivetrain_jax.store.consolidate import ResultFile, open_result, read_attribute, release, write_result
-from drivetrain_jax.store.netcdf import Coordinate, Labelled
+from drivetrain_jax.store.consolidate import (
+    Coordinate,
+    Labelled,
+    ResultFile,
+    open_result,
+    read_attribute,
+    release,
+    write_result,
+)
 
 
 @pytest.fixture
