@@ -18,8 +18,8 @@ from drivetrain_jax.runs.assemble import PENDING, labelled, missing_value, sweep
 from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.job import Block, Job, Results
 from drivetrain_jax.runs.scene import restore_scene, result_variables
-from drivetrain_jax.store import checksums, zarr_store
-from drivetrain_jax.store.consolidate import Labelled, ResultFile, read_attribute, release
+from drivetrain_jax.store import zarr_store
+from drivetrain_jax.store.consolidate import Labelled, ResultFile, release
 from drivetrain_jax.store.files import flush_tree, move_folder
 from drivetrain_jax.store.parts import PartsFolder
 
@@ -76,19 +76,13 @@ class ZarrBlocks:
         return cls(job, os.path.abspath(parts.path / zarr_store.UNFINISHED))
 
     def create(self) -> None:
-        """Create the store, unless a stopped run has left exactly that."""
-        path, blank = Path(self.place), self.template
-        # Moved in one step, so the store at this path is always whole.
-        half = path.with_name("half")
+        """Create the store; renew all but the shards of one that a stopped run has left, whose metadata may be damaged."""
+        path, half = Path(self.place), Path(self.place).with_name("half")
         shutil.rmtree(half, ignore_errors=True)
         fills = {v.name: missing_value(v) for v in result_variables(self.job.scene)} | {OUTCOME.name: PENDING}
-        zarr_store.create(half, with_pending(blank), self.job.boxes, fills)
-        if zarr_store.matches(path, half):
-            shutil.rmtree(half)
-            return
-        shutil.rmtree(path, ignore_errors=True)
-        flush_tree(half)
-        move_folder(half, path)
+        zarr_store.create(half, with_pending(self.template), self.job.boxes, fills)
+        shutil.copytree(half, path, dirs_exist_ok=True)
+        shutil.rmtree(half)
 
     @property
     def template(self) -> Labelled:
@@ -150,22 +144,14 @@ def export(store: Path, out: Path) -> int:
         raise InputError(f"store = {str(store)!r}: not a Zarr store; give one of `drivetrain run --store zarr`")
     if not zarr_store.is_sealed(store):
         raise _damaged(store, "its attributes are damaged, or it is not finished")
-    attrs, parts = zarr_store.attributes(store), PartsFolder(out)
-    scene = restore_scene(attrs["scene"])
-    points = math.prod(Grid.of(scene).result_shape)
-    if parts.path.is_dir() and _is_copy(out, attrs["digest"]):
-        # An export that was killed after it had moved its file into place.
-        parts.open()
-        parts.close(remove=True)
-        return points
-    if out.exists() or not out.parent.is_dir() or parts.holds_work():
+    if out.exists() or not out.parent.is_dir() or PartsFolder(out).holds_work():
         raise InputError(f"out = {str(out)!r}: allowed is a new file in an existing folder, without unfinished work")
+    attrs, layout, shards = zarr_store.attributes(store), zarr_store.layout(store), zarr_store.shards_of(store)
+    scene = restore_scene(attrs["scene"])
     kept = {name: value for name, value in attrs.items() if name not in (zarr_store.SEAL, "coordinates")}
-    layout, shards = zarr_store.layout(store), zarr_store.shards_of(store)
     zeros = {v.name: np.broadcast_to(np.zeros((), v.dtype), layout[v.name][1]) for v in result_variables(scene)}
     try:
-        parts.open()
-        with ResultFile(parts.result) as file:
+        with ResultFile(out.with_name(f"{out.name}.{os.getpid()}.tmp")) as file:
             arrays = file.lay_out(labelled(scene, zeros, kept))
             for shard in range(shards.count):
                 results = zarr_store.read(store, shards, shard)
@@ -177,16 +163,7 @@ def export(store: Path, out: Path) -> int:
             file.finish(out)
     except OSError as error:
         raise RetryableError(f"out = {str(out)!r}: {error}; the same command tries again") from None
-    finally:
-        parts.close(remove=True)
-    return points
-
-
-def _is_copy(out: Path, digest: str) -> bool:
-    try:
-        return out.is_file() and read_attribute(out, "digest") == digest and checksums.damaged(out) == []
-    except InputError:
-        return False
+    return math.prod(Grid.of(scene).result_shape)
 
 
 def _damaged(store: Path, what: str) -> InputError:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -20,7 +21,7 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import counted
 from drivetrain_jax.store.consolidate import DETAILS, GROUP, Labelled
-from drivetrain_jax.store.files import digest, flush, sync_folder
+from drivetrain_jax.store.files import digest, flush, source_digest, sync_folder
 from drivetrain_jax.store.parts import Place, Shards
 
 # Folder among the parts in which a store grows, and the one for a store while another one replaces it.
@@ -77,32 +78,21 @@ def shards_of(path: Path) -> Shards:
         raise _damaged(path) from None
 
 
-def matches(path: Path, empty: Path) -> bool:
-    """True if the store at ``path`` is finished, or grows from the metadata and coordinates of the ``empty`` one."""
-    try:
-        same = done(path).shape == done(empty).shape
-        return same and (is_sealed(path) or digest(_layout(path)) == digest(_layout(empty)))
-    except (InputError, *_BROKEN):
-        return False
-
-
 def layout(path: Path) -> dict[str, tuple[np.dtype, tuple[int, ...]]]:
     """Types and shapes of the results by name."""
     root = _root(path)
     return {name: (root[name].dtype, tuple(root[name].shape)) for name in root[_CHECKSUMS].attrs[_RESULTS]}
 
 
-def write(path: Path, place: Place, arrays: Mapping[str, np.ndarray], shard: int | None) -> None:
-    """Write the results of a shard, and mark number ``shard`` done if given, after its results are flushed to disk."""
+def write(path: Path, place: Place, arrays: Mapping[str, np.ndarray], shard: int) -> None:
+    """Write the results of number ``shard``, and mark it done after its results are flushed to disk."""
     root = _root(path, "r+")
     for name, values in arrays.items():
         root[name][(*place, ...)] = values
-    if shard is not None:
-        for name in arrays:
-            first = [part.start // length for part, length in zip(place, root[name].chunks, strict=False)]
-            _flush_chunk(path, root[name], (*first, *[0] * (root[name].ndim - len(first))))
-        root[_OF_SHARDS][shard] = _checksum(arrays)
-        _flush_chunk(path, root[_OF_SHARDS], (shard,))
+        first = [part.start // length for part, length in zip(place, root[name].chunks, strict=False)]
+        _flush_chunk(path, root[name], (*first, *[0] * (root[name].ndim - len(first))))
+    root[_OF_SHARDS][shard] = _checksum(arrays)
+    _flush_chunk(path, root[_OF_SHARDS], (shard,))
 
 
 def _flush_chunk(path: Path, array: Any, index: tuple[int, ...]) -> None:
@@ -174,8 +164,9 @@ def seal(path: Path, attrs: Mapping[str, Any], labels: Mapping[str, Mapping[str,
     root.attrs.put({**kept, **{name: value for name, value in attrs.items() if name not in DETAILS}})
     root[GROUP].attrs.put({name: value for name, value in attrs.items() if name in DETAILS})
     _consolidate(path)
-    root.attrs[SEAL] = _digest(path)
-    _consolidate(path)
+    content = json.loads((path / "zarr.json").read_text())
+    content["attributes"][SEAL] = _digest(path)
+    (path / "zarr.json").write_text(json.dumps(content, indent=2))
 
 
 def _consolidate(path: Path) -> None:
@@ -209,22 +200,16 @@ def is_sealed(path: Path) -> bool:
 
 
 def _digest(path: Path) -> str:
-    """Digest of attributes, metadata and coordinates."""
-    attrs = {name: value for name, value in _root(path).attrs.items() if name != SEAL}
-    return digest([attrs, *_layout(path)])
-
-
-def _layout(path: Path) -> list[dict[str, Any]]:
-    """Metadata of all groups and arrays, the consolidated attributes, and the coordinates."""
-    root = _root(path)
-    results = set(root[_CHECKSUMS].attrs[_RESULTS])
-    files = sorted({path / GROUP, path / _CHECKSUMS, path / _OF_SHARDS, *(path / name for name in root.array_keys())})
-    metadata = {file.relative_to(path).as_posix(): json.loads((file / "zarr.json").read_text()) for file in files}
-    coords = {name: np.asarray(root[name][...]) for name in sorted(root.array_keys()) if name not in results}
-    copy = _zarr().open_group(path, mode="r")
-    copied = {name: dict(copy[name].attrs) for name in sorted(root.array_keys())}
-    labels = {name: values.tolist() if values.dtype.kind in ("O", "T") else values for name, values in coords.items()}
-    return [metadata, copied, labels]
+    """Digest of all files except the shards, without the digest itself."""
+    content = json.loads((path / "zarr.json").read_text())
+    content["attributes"].pop(SEAL, None)
+    results = json.loads((path / _CHECKSUMS / "zarr.json").read_text())["attributes"][_RESULTS]
+    shards, files = {path / name / "c" for name in (*results, _OF_SHARDS)}, {}
+    for folder, names, found in os.walk(path):
+        names[:] = [name for name in names if Path(folder, name) not in shards]
+        files |= {file.relative_to(path).as_posix(): file for file in (Path(folder, name) for name in found)}
+    own = {name: file for name, file in files.items() if file not in {path / "zarr.json", *shards}}
+    return digest([content, source_digest(own)])
 
 
 def _checksum(arrays: Mapping[str, np.ndarray]) -> int:
