@@ -443,7 +443,7 @@ def export(options: argparse.Namespace) -> int:
     elif options.file is None:
         raise InputError("FILE.nc: missing; allowed is a new file, or --csv for a table")
     else:
-        from drivetrain_jax.runs.stores import export
+        from drivetrain_jax.runs.assemble import export
 
         count = export(options.store, options.file)
     sys.stderr.write(f"points: {count} exported\n")

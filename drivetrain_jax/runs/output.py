@@ -17,7 +17,16 @@ import numpy as np
 import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.runs.assemble import PENDING, ResultBuffer, labelled, misfits, with_pending
+from drivetrain_jax.runs.assemble import (
+    PENDING,
+    BlockStore,
+    ResultBuffer,
+    ZarrBlocks,
+    labelled,
+    misfits,
+    stored_blocks,
+    with_pending,
+)
 from drivetrain_jax.runs.job import Job, Results, resolve
 from drivetrain_jax.runs.reuse import (
     NO_REUSE,
@@ -30,7 +39,6 @@ from drivetrain_jax.runs.reuse import (
     find,
 )
 from drivetrain_jax.runs.scene import load_scene, restore_scene
-from drivetrain_jax.runs.stores import BlockStore, ZarrBlocks, stored_blocks
 from drivetrain_jax.store import checksums, consolidate, zarr_store
 from drivetrain_jax.store.checksums import opened
 from drivetrain_jax.store.files import behind_link

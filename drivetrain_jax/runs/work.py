@@ -23,10 +23,9 @@ from drivetrain_jax._machine import threads, usable_cores
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax._wording import shown
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.runs.assemble import ResultBuffer, labelled
+from drivetrain_jax.runs.assemble import BlockStore, ResultBuffer, labelled, stored_blocks
 from drivetrain_jax.runs.job import Block, Chunk, Job, Results
 from drivetrain_jax.runs.reuse import NO_REUSE, ReusedPoints
-from drivetrain_jax.runs.stores import BlockStore, stored_blocks
 from drivetrain_jax.store.consolidate import Labelled, ResultFile
 
 # Most threads or processes, unless four a core are more.

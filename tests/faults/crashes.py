@@ -59,7 +59,7 @@ SCENES = {"small": scene(14, 3), "large": scene(20, 3), "other": scene(14, 4), "
 STORE = ["--store", "zarr"]
 # Modules that the commands import late, and that start no thread.
 MODULES = ("matplotlib.pyplot", "xarray", "zarr", "h5netcdf", "diffrax", "drivetrain_jax.systems.cardan")
-MODULES += ("drivetrain_jax.runs.run", "drivetrain_jax.runs.stores", "drivetrain_jax.invariants")
+MODULES += ("drivetrain_jax.runs.run", "drivetrain_jax.runs.assemble", "drivetrain_jax.invariants")
 MODULES += ("drivetrain_jax.analysis.floquet.propagator", "drivetrain_jax.analysis.atlas.analysis")
 
 

@@ -15,11 +15,10 @@ from drivetrain_jax import InputError
 from drivetrain_jax._machine import threads
 from drivetrain_jax.cli import main
 from drivetrain_jax.invariants import verify
-from drivetrain_jax.runs import stores, toml
-from drivetrain_jax.runs.assemble import PENDING
+from drivetrain_jax.runs import assemble, toml
+from drivetrain_jax.runs.assemble import PENDING, export
 from drivetrain_jax.runs.output import status
 from drivetrain_jax.runs.run import Incomplete, Interrupted, run, run_to_file
-from drivetrain_jax.runs.stores import export
 from drivetrain_jax.runs.work import Threads
 from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.consolidate import read_attribute
@@ -292,7 +291,7 @@ def test_a_store_that_workers_wrote_elsewhere_is_not_finished(grid_scene, tmp_pa
 
 
 def test_a_kill_while_a_store_is_replaced_loses_no_block(grid_scene, tmp_path, monkeypatch):
-    path, other, move = tmp_path / "r.zarr", grid_scene | {"fixed": {"n": 4}}, stores.move_folder
+    path, other, move = tmp_path / "r.zarr", grid_scene | {"fixed": {"n": 4}}, assemble.move_folder
     to_store(grid_scene, path)
     with pytest.raises(InputError, match=r"fixed.n is 4, was 3; --fresh replaces it"):
         to_store(other, path)
@@ -303,7 +302,7 @@ def test_a_kill_while_a_store_is_replaced_loses_no_block(grid_scene, tmp_path, m
         move(folder, target)
 
     with monkeypatch.context() as replacing:
-        replacing.setattr(stores, "move_folder", killed)
+        replacing.setattr(assemble, "move_folder", killed)
         with pytest.raises(KeyboardInterrupt):
             to_store(other, path, fresh=True)
     assert not path.exists() and (status(other, path).done, status(grid_scene, path).state) == (123, "stale")
