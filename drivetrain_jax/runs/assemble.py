@@ -1,4 +1,4 @@
-"""Results of blocks: the labelled result that they make, and the stores that keep them until they are joined, files or Zarr."""
+"""Results of blocks: the labelled result that they make, and the stores that keep them until they are joined."""
 
 from __future__ import annotations
 
