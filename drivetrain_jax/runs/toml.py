@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
-from types import NoneType
 from typing import Any
 
 import msgspec
@@ -32,31 +31,17 @@ def read(
     ``source`` is a path, the name of a scene that the package brings, or a mapping. ``overrides`` replaces single
     entries, for example ``{"fixed.zeta": 0.002}``; the text then is that of the changed scene.
     """
-    try:
-        return _read(source, overrides)
-    except RecursionError:
-        given = "a table" if isinstance(source, Mapping) else repr(str(source))
-        raise InputError(f"scene = {given}: not valid TOML: nested too deeply") from None
-
-
-def _read(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None) -> tuple[dict[str, Any], str]:
     if isinstance(source, Mapping):
         tree, text = plain(source), None
-    elif not isinstance(source, (str, os.PathLike)):
-        raise InputError(f"scene = {shown(source)}: allowed is the path of a scene file, or a table")
-    else:
+    elif isinstance(source, (str, os.PathLike)):
         text = _text(Path(source).expanduser())
         try:
             tree = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
-            end = f"at line {len(text.splitlines())}, the end of the file"
-            reason = str(error).replace("at end of document", end)
-            reason += "; words and numbers with units stand in quotes, numbers begin with a digit" * (
-                reason.startswith("Invalid value")
-            )
-            raise InputError(f"scene = {str(source)!r}: not valid TOML: {reason}") from None
-        except ValueError:
-            raise InputError(f"scene = {str(source)!r}: a number of too many digits; allowed are up to 4300") from None
+        except (ValueError, RecursionError) as error:
+            hint = "; words and numbers with units stand in quotes" * str(error).startswith("Invalid value")
+            raise InputError(f"scene = {str(source)!r}: not valid TOML: {error}{hint}") from None
+    else:
+        raise InputError(f"scene = {shown(source)}: allowed is the path of a scene file, or a table")
     if overrides:
         text = None
         if not isinstance(overrides, Mapping) or not all(isinstance(key, str) and key for key in overrides):
@@ -68,7 +53,6 @@ def _read(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] |
             if key.startswith("axes.") and isinstance(fixed := tree.get("fixed"), dict):
                 # The axis takes the place of the fixed value.
                 fixed.pop(key.split(".")[1], None)
-    _check(tree, "scene")
     return tree, write(_with_axes_as_tables(tree)) if text is None else text
 
 
@@ -102,20 +86,6 @@ def plain(value: Any) -> Any:
     return [plain(entry) for entry in value] if isinstance(value, (list, tuple, range)) else value
 
 
-def _check(value: Any, field: str) -> None:
-    """Raise :class:`InputError` unless ``value`` has a type of TOML."""
-    if isinstance(value, Mapping):
-        for name, entry in value.items():
-            if not isinstance(name, str):
-                raise InputError(f"{field}: the key {name!r}; allowed are words")
-            _check(entry, name if field == "scene" else f"{field}.{name}")
-    elif isinstance(value, list):
-        for entry in value:
-            _check(entry, field)
-    elif not isinstance(value, (int, float, str, NoneType)):
-        raise InputError(f"{field} = {shown(value)}: allowed is text, a number, true, false, a list or a table")
-
-
 def _text(path: Path) -> str:
     try:
         # Editors on Windows put a byte order mark first.
@@ -145,36 +115,14 @@ def converted(given: Any, kind: type, where: str) -> Any:
     names = [field.name for field in msgspec.structs.fields(kind)]
     for key in given:
         if key not in names:
-            raise InputError(f"{where}{key} = {shown(given[key])}: unknown key{nearest(key, names)}")
+            raise InputError(f"{where}{key} = {shown(given[key])}: unknown key{nearest(str(key), names)}")
     try:
         return msgspec.convert(given, kind)
     except msgspec.ValidationError as error:
         reason, _, path = str(error).partition(" - at `$.")
-        if missing := re.search(r"missing required field `(\w+)`", reason):
-            name = missing.group(1)
-            raise InputError(f"{where}{name}: missing; {_MISSING.get(name, 'it must be given')}") from None
         name = re.split(r"\W", path, maxsplit=1)[0]
-        reason = re.sub(r"`([^`]*)`", _toml_types, reason)
-        raise InputError(
-            f"{where}{name} = {shown(given.get(name))}: {reason.replace('Expected', 'allowed is')}"
-        ) from None
-
-
-_TOML_TYPES = {
-    "object": "table",
-    "array": "list",
-    "str": "text",
-    "int": "integer",
-    "float": "number",
-    "bool": "boolean",
-}
-_MISSING = {"system": "give the name of a system", "analysis": "give the name of an analysis"}
-
-
-def _toml_types(match: re.Match[str]) -> str:
-    """A type such as ``int | null`` in the words of TOML, which has no null."""
-    words = [_TOML_TYPES.get(word, word) for word in match.group(1).split(" | ") if word != "null"]
-    return " or ".join(words) or "nothing"
+        field = f"{where}{name} = {shown(given.get(name))}" if name else where.rstrip(".") or "scene"
+        raise InputError(f"{field}: {reason[:1].lower()}{reason[1:]}") from None
 
 
 def parse_value(text: str) -> Any:

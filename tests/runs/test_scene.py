@@ -20,11 +20,6 @@ TWO_SEGMENTS = {"length": [1.0, 1.0], "EI": [1.0, 1.0], "rhoA": [1.0, 1.0], "k_A
 SHAFT = {"system": "bicardan", "analysis": "critical_speeds", "fixed": TWO_SEGMENTS}
 
 
-class Lines:
-    def __repr__(self):
-        return "one\ntwo"
-
-
 def changed(**changes):
     return GOOD | changes
 
@@ -144,12 +139,12 @@ def test_values_on_the_command_line(text, value):
 
 WRONG = {
     "unknown key": (changed(axis={}), "axis", "axes"),
-    "missing system": ({"analysis": "toy"}, "system", "missing"),
+    "missing system": ({"analysis": "toy"}, "system", "missing required field"),
     "unknown system": (changed(system="tooy"), "tooy", "cardan"),
     "unknown analysis": (changed(analysis="ty"), "ty", "allowed for toy is one of toy, slow"),
     "analysis of another system": (changed(system="cardan", analysis="toy"), "toy", "floquet"),
-    "wrong type of a key": (changed(title=3), "title = 3", "text"),
-    "wrong type of outputs": (changed(outputs=3), "outputs", "list"),
+    "wrong type of a key": (changed(title=3), "title = 3", "expected `str`"),
+    "wrong type of outputs": (changed(outputs=3), "outputs = 3", "expected `array | null`"),
     "unknown output": (changed(outputs=["valu"]), "valu", "did you mean value?"),
     "no output": (changed(outputs=[]), "outputs = []", "value"),
     "output twice": (changed(outputs=["value", "value"]), "outputs", "once"),
@@ -184,14 +179,22 @@ WRONG = {
     "num not finite": (
         changed(axes={"a": {"start": 0, "stop": 1, "num": float("inf")}}),
         "axes.a.num = inf",
-        "integer",
+        "expected `int",
     ),
-    "num of the wrong type": (changed(axes={"a": {"start": 0, "stop": 1, "num": 2.5}}), "axes.a.num = 2.5", "integer"),
+    "num of the wrong type": (
+        changed(axes={"a": {"start": 0, "stop": 1, "num": 2.5}}),
+        "axes.a.num = 2.5",
+        "expected `int",
+    ),
     "axis without num": (changed(axes={"a": {"start": 0, "stop": 1}}), "axes.a.num", "atlas"),
     "axis without stop": (changed(axes={"a": {"start": 0, "num": 3}}), "axes.a.stop: missing", "values"),
     "axis with everything": (changed(axes={"a": {"start": 0, "values": [1]}}), "axes.a", "one of the two"),
     "unknown key of an axis": (changed(axes={"a": {"begin": 0}}), "axes.a.begin", "start"),
-    "axis of two dimensions": (changed(axes={"a": np.zeros((2, 2))}), "axes.a.values = [[0.0", "number"),
+    "axis of two dimensions": (
+        changed(axes={"a": np.zeros((2, 2))}),
+        "axes.a.values = [[0.0",
+        "expected `int | float | str`",
+    ),
     "axis that is one number": (changed(axes={"a": np.float64(0.5)}), "axes.a = 0.5", "row of values"),
     "axis that is no table": (changed(axes={"a": 3}), "axes.a = 3", "table"),
     "unknown scale": (changed(axes={"a": {"start": 1, "stop": 2, "num": 3, "scale": "ln"}}), "'ln'", "lin, log"),
@@ -246,7 +249,6 @@ WRONG = {
         "points.length[2]",
         "length[0] to length[1]",
     ),
-    "value of many lines": (changed(fixed={"b": Lines()}), "fixed.b = one two", "a number"),
     "long list for a number": (changed(fixed={"b": [0.5] * 1000}), "fixed.b = [0.5, 0.5,", "...: allowed"),
     "list of one": (
         {"system": "planetary", "analysis": "modes", "fixed": {"planet_angle": [0.0, 2.0], "m_p": [1.0]}},
@@ -283,11 +285,7 @@ WRONG = {
         "not used by method plain, but by other;",
     ),
     "option out of range": (changed(options={"rtol": 1.0}), "options.rtol = 1.0", "0.01"),
-    "key that is no word": (changed(axes={5: {"values": [1]}}), "axes: the key 5", "words"),
-    "scene with a key that is no word": ({**GOOD, 5: 1}, "scene: the key 5", "words"),
-    "set of outputs": (changed(outputs={"value"}), "outputs = {'value'}", "a list"),
-    "bytes": (changed(title=b"x"), "title = b'x'", "text"),
-    "complex number": (changed(fixed={"b": 1j}), "fixed.b = 1j", "a number"),
+    "bytes": (changed(title=b"x"), "title = b'x'", "expected `str`"),
     "number for a scene": (5, "scene = 5", "path of a scene file"),
     "nothing": (None, "scene = None", "path of a scene file"),
     "too many points": (
@@ -310,12 +308,12 @@ def test_wrong_scene_is_one_clear_line(case):
 @pytest.mark.parametrize(
     ("content", "part"),
     [
-        (b"a = " + b"9" * 5000, "a number of too many digits; allowed are up to 4300"),
-        (b"a = [1", "line 1"),
+        (b"a = " + b"9" * 5000, "not valid TOML: Exceeds the limit"),
+        (b"a = [1", "not valid TOML: .*at end of document"),
         (b"\xff\xfe", "UTF-8"),
         (None, "No such file"),
-        (b"a=1\na=2", "line 2"),
-        (b"a = " + b"[" * 5000 + b"]" * 5000, "nested too deeply"),
+        (b"a = 1\nb = x", "at line 2, column 5.; words and numbers with units stand in quotes"),
+        (b"a = " + b"[" * 5000 + b"]" * 5000, "not valid TOML: maximum recursion"),
     ],
 )
 def test_wrong_file_is_one_clear_line(tmp_path, content, part):
@@ -324,13 +322,6 @@ def test_wrong_file_is_one_clear_line(tmp_path, content, part):
         path.write_bytes(content)
     with pytest.raises(InputError, match=part):
         load_scene(path)
-
-
-def test_a_recursive_table_is_one_clear_line():
-    tree = {}
-    tree["fixed"] = tree
-    with pytest.raises(InputError, match="scene = a table: not valid TOML: nested too deeply"):
-        load_scene(tree)
 
 
 @pytest.mark.parametrize("overrides", [{5: 1}, {"": 1}, [1], "fixed.a"])
