@@ -248,7 +248,6 @@ def declared(units="1", roles=(), model=None, **serving):
         (lambda: swept(lambda p: {"r/s": p["a"]}), "returns a result 'r/s'; allowed is another name, without /"),
         (lambda: swept(lambda p: {"checksums": p["a"]}), "returns a result 'checksums'; allowed is another name"),
         (lambda: swept(lambda p: {"": p["a"]}), "returns a result ''; allowed is another name"),
-        (lambda: swept(lambda p: {"r": jax.random.key(0)}), "returns 'r' as key.*; allowed is float64, for example"),
         (lambda: dt.sweep(len, {"outcome": 1.0}, over={"outcome": [0.0]}), "over.outcome: the name of a result"),
         (lambda: swept(len, {"a": [True, False]}), r"over.a: got \[True, False\]; allowed are numbers"),
         (lambda: swept(len, {"a": np.ma.masked_equal([0.0, 1.0], 1.0)}), "over.a: got .*; allowed are numbers"),

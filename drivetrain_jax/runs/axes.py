@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 import numpy as np
@@ -26,7 +26,7 @@ MAX_RANGES = 4
 _SCALES = ("lin", "log")
 
 
-class WrittenAxis(msgspec.Struct, forbid_unknown_fields=True):
+class AxisTable(msgspec.Struct, forbid_unknown_fields=True):
     """The keys of one axis: ``start, stop, num`` and ``scale``, or ``values``; texts are numbers with units."""
 
     start: float | int | str | None = None
@@ -34,17 +34,6 @@ class WrittenAxis(msgspec.Struct, forbid_unknown_fields=True):
     num: int | None = None
     scale: str | None = None
     values: list[float | int | str] | None = None
-
-
-@dataclass(frozen=True)
-class AxisTable:
-    """The keys of one axis with numbers alone."""
-
-    start: float | None
-    stop: float | None
-    num: int | None
-    scale: str | None
-    values: list[float] | None
 
 
 @dataclass(frozen=True)
@@ -89,14 +78,16 @@ class Axis:
         return label if self.entry is None else f"{label}, entry {self.entry}"
 
 
-def in_units(spec: WrittenAxis, parameter: Parameter, *, keep: bool) -> tuple[AxisTable, Parameter]:
-    """The keys of an axis with numbers for texts such as ``"200 rpm"``, and the parameter in the unit of the numbers.
+def in_units(table: AxisTable, parameter: Parameter, where: str, *, keep: bool) -> tuple[AxisTable, Parameter]:
+    """The checked keys of an axis with numbers for texts such as ``"200 rpm"``, and the parameter in their unit.
 
-    That is its own unit or, with ``keep``, the unit of the first text. Raises :class:`InputError` for a text that is none.
+    That is its own unit or, with ``keep``, the unit of the first text. Raises :class:`InputError` for a number that is out
+    of range, and for a text that is none.
     """
-    texts = [v for v in (spec.start, spec.stop, *(spec.values or ())) if isinstance(v, str)]
-    for text in texts:
-        checked(parameter, text, "axes.")
+    given = [*(end for end in (table.start, table.stop) if end is not None), *(table.values or ())]
+    for value in given:
+        checked(parameter, value, where)
+    texts = [value for value in given if isinstance(value, str)]
     split = _units.split(texts[0]) if keep and texts else None
     described = in_unit(parameter, split[1]) if split else parameter
 
@@ -107,8 +98,8 @@ def in_units(spec: WrittenAxis, parameter: Parameter, *, keep: bool) -> tuple[Ax
             return value
         return value * _units.factor(parameter.units, described.units)
 
-    values = None if spec.values is None else [plain(value) for value in spec.values]
-    return AxisTable(plain(spec.start), plain(spec.stop), spec.num, spec.scale, values), described
+    values = None if table.values is None else [plain(value) for value in table.values]
+    return msgspec.structs.replace(table, start=plain(table.start), stop=plain(table.stop), values=values), described
 
 
 def in_unit(parameter: Parameter, unit: str) -> Parameter:
@@ -127,77 +118,60 @@ def entry_of(name: str) -> tuple[str, int | None]:
     return (match.group(1), int(match.group(2))) if match else (name, None)
 
 
-def check_count(name: str, spec: AxisTable, continuous: bool) -> int:
+def check_count(name: str, table: AxisTable, continuous: bool) -> int:
     """Number of values of an axis, before they are computed; raises for incomplete or contradictory keys.
 
     A ``continuous`` axis has two values, its ends.
     """
     field = f"axes.{name}"
-    if continuous:
-        return _check_range(field, spec)
-    if spec.values is not None:
-        if any(x is not None for x in (spec.start, spec.stop, spec.num, spec.scale)):
-            raise InputError(
-                f"{field}: values given together with start, stop, num or scale; allowed is one of the two"
-                f" ({field} = [...] replaces the whole axis)"
-            )
-        if not spec.values:
+    given = [key for key in table.__struct_fields__ if getattr(table, key) is not None]
+    if continuous and (extra := [key for key in given if key not in ("start", "stop")]):
+        value = getattr(table, extra[0])
+        raise InputError(f"{field}.{extra[0]} = {value!r}: an atlas has ranges; allowed is start and stop")
+    if table.values is not None:
+        if given != ["values"]:
+            allowed = f"allowed is one of the two ({field} = [...] replaces the whole axis)"
+            raise InputError(f"{field}: values given together with {', '.join(given[:-1])}; {allowed}")
+        if not table.values:
             raise InputError(f"{field}.values = []: empty axis; allowed is one value or more")
-        return len(spec.values)
-    for key in ("start", "stop"):
-        if getattr(spec, key) is None:
-            raise InputError(f"{field}.{key}: missing; allowed is start, stop and num, or values")
-    assert spec.start is not None and spec.stop is not None
-    if spec.num is None:
+        return len(table.values)
+    if missing := [key for key in ("start", "stop") if key not in given]:
+        allowed = "start and stop" if continuous else "start, stop and num, or values"
+        raise InputError(f"{field}.{missing[0]}: missing; allowed is {allowed}")
+    start, stop, num = cast(float, table.start), cast(float, table.stop), table.num
+    if continuous:
+        if not start < stop:
+            raise InputError(f"{field}.stop = {stop!r}: allowed is stop > start = {start!r}")
+        return 2
+    if num is None:
         raise InputError(f"{field}.num: missing; allowed is num >= 1 (a range without num: analysis = 'atlas')")
-    if spec.num < 1:
-        raise InputError(f"{field}.num = {spec.num}: empty axis; allowed is num >= 1")
-    if spec.num == 1 and spec.start != spec.stop:
-        ends = f"start = {spec.start!r} and stop = {spec.stop!r}"
-        raise InputError(f"{field}.num = 1: {ends} are two values; allowed is num >= 2, or values = [{spec.start!r}]")
-    if spec.scale not in (None, *_SCALES):
-        raise InputError(f"{field}.scale = {spec.scale!r}: allowed is one of {', '.join(_SCALES)}")
-    if spec.scale == "log" and not (spec.start > 0 and spec.stop > 0):
-        key = "stop" if spec.start > 0 else "start"
-        raise InputError(f"{field}.{key} = {getattr(spec, key)}: allowed on a log axis is {key} > 0")
-    return spec.num
+    if num < 1:
+        raise InputError(f"{field}.num = {num}: empty axis; allowed is num >= 1")
+    if num == 1 and start != stop:
+        ends = f"start = {start!r} and stop = {stop!r}"
+        raise InputError(f"{field}.num = 1: {ends} are two values; allowed is num >= 2, or values = [{start!r}]")
+    if table.scale not in (None, *_SCALES):
+        raise InputError(f"{field}.scale = {table.scale!r}: allowed is one of {', '.join(_SCALES)}")
+    if table.scale == "log" and not (start > 0 and stop > 0):
+        key, value = ("stop", stop) if start > 0 else ("start", start)
+        raise InputError(f"{field}.{key} = {value}: allowed on a log axis is {key} > 0")
+    return num
 
 
-def _check_range(field: str, spec: AxisTable) -> int:
-    for key in ("values", "num", "scale"):
-        if getattr(spec, key) is not None:
-            raise InputError(f"{field}.{key} = {getattr(spec, key)!r}: an atlas has ranges; allowed is start and stop")
-    for key in ("start", "stop"):
-        if getattr(spec, key) is None:
-            raise InputError(f"{field}.{key}: missing; allowed is start and stop")
-    assert spec.start is not None and spec.stop is not None
-    if not spec.start < spec.stop:
-        raise InputError(f"{field}.stop = {spec.stop!r}: allowed is stop > start = {spec.start!r}")
-    return 2
-
-
-def spread(spec: AxisTable, field: str) -> np.ndarray:
+def spread(table: AxisTable, field: str) -> np.ndarray:
     """The values of a checked axis; raises if a value occurs twice."""
-    if spec.values is not None:
-        values = np.array(spec.values, float)
-    elif spec.num is None:
-        values = np.array([spec.start, spec.stop], float)
+    if table.values is not None:
+        values = np.array(table.values, float)
     else:
-        values = _between(spec, field)
+        ends, num = (
+            (float(cast(float, table.start)), float(cast(float, table.stop))),
+            2 if table.num is None else table.num,
+        )
+        values = np.geomspace(*ends, num) if table.scale == "log" else np.linspace(*ends, num)
     ordered = np.sort(values)
     double = np.flatnonzero(ordered[1:] == ordered[:-1])
     if double.size:
         raise InputError(f"{field}: the value {ordered[double[0]]:.10g} occurs twice; allowed are distinct values")
-    return values
-
-
-def _between(spec: AxisTable, field: str) -> np.ndarray:
-    assert spec.start is not None and spec.stop is not None and spec.num is not None
-    with np.errstate(over="ignore", invalid="ignore"):
-        values = (np.geomspace if spec.scale == "log" else np.linspace)(float(spec.start), float(spec.stop), spec.num)
-    if not np.isfinite(values).all():
-        ends = f"start = {spec.start!r}, stop = {spec.stop!r}"
-        raise InputError(f"{field}: {ends}: not all values between are finite; allowed are ends closer together")
     return values
 
 

@@ -168,7 +168,7 @@ def _function_scene(
         described = known.get(entry_of(name)[0], Parameter(name, "1", name))
         scalar = replace(described, name=name, listed=False, broadcast=False)
         row = [checked(scalar, value, "over.") for value in _row(name, given)]
-        values[name] = spread(AxisTable(None, None, None, None, _numbers(name, row)), f"over.{name}")
+        values[name] = spread(AxisTable(values=[*_numbers(name, row)]), f"over.{name}")
     name = re.sub(r"\W", "_", getattr(function, "__name__", "function")).strip("_") or "value"
 
     own = {"outputs": outputs} if results and outputs is not None else {}
@@ -179,7 +179,6 @@ def _function_scene(
     example = {key: jax.ShapeDtypeStruct((), float) for key in values}
     traced, shapes = jax.make_jaxpr(one, return_shape=True)(example)
     _check_concrete(traced.consts)
-    _check_outcome(shapes)
     wanted = _wanted(outputs, [key for key in shapes if key != OUTCOME.name], name)
     content = [re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr)), *(np.asarray(x).tobytes() for x in traced.consts)]
     computes = hashlib.blake2b(repr(content).encode(), digest_size=16).hexdigest()
@@ -282,8 +281,10 @@ def _named(result: Any, name: str) -> dict[str, Array]:
             raise InputError(f"function: returns {given}; allowed is an array or a flat dict of arrays") from None
         if not _STORED_NAME.fullmatch(str(key)) or key in _RESERVED:
             raise InputError(f"function: returns a result {key!r}; allowed is another name, without /")
-        if getattr(found[str(key)].dtype, "kind", "V") not in "biufc":
-            raise InputError(f"function: returns {key!r} as {found[str(key)].dtype}; allowed is float64, for example")
+        array = found[str(key)]
+        if key == OUTCOME.name and (array.ndim or not jnp.issubdtype(array.dtype, jnp.integer)):
+            allowed = f"allowed is one integer, a code of the outcome from 0 to {max(Outcome)}, or another name"
+            raise InputError(f"outcome: the function returns {array.dtype} of the shape {array.shape}; {allowed}")
     return found
 
 
@@ -308,16 +309,6 @@ def _check_concrete(*values: Any) -> None:
         )
 
 
-def _check_outcome(shapes: Mapping[str, jax.ShapeDtypeStruct]) -> None:
-    """Check that a result called ``outcome`` is a code, because files store it as one."""
-    given = shapes.get(OUTCOME.name)
-    if given is not None and (given.shape or not jnp.issubdtype(given.dtype, jnp.integer)):
-        raise InputError(
-            f"outcome: the function returns {given.dtype} of the shape {given.shape}; allowed is one integer, "
-            f"a code of the outcome from 0 to {max(Outcome)}, or another name"
-        )
-
-
 def replaced(system: Any, point: Mapping[str, Any]) -> Any:
     """``system`` with these parameters, keys or attributes, or entries of them, replaced."""
     for name, value in point.items():
@@ -325,10 +316,7 @@ def replaced(system: Any, point: Mapping[str, Any]) -> Any:
         if base not in (names := _names(system)):
             raise InputError(f"over.{name}: unknown to a {type(system).__name__}{nearest(base, names)}")
         old = system[base] if isinstance(system, Mapping) else getattr(system, base)
-        if entry is not None:
-            value = _with_entry(old, entry, value, name)
-        elif not (isinstance(system, System) and system.parameter(base).is_number):
-            _check_number(old, name)
+        value = _number(system, old, name, value) if entry is None else _with_entry(old, entry, value, name)
         if isinstance(system, Mapping):
             system = {**system, base: value}
         else:
@@ -345,29 +333,25 @@ def _names(system: Any) -> list[str]:
     return list(getattr(system, "_fields", getattr(system, "__dict__", ())))
 
 
+def _number(system: Any, old: Any, name: str, value: Array) -> Array:
+    """``value``, which may stand for the number ``old``; a number of a system may be missing."""
+    listed = isinstance(old, (list, tuple)) or getattr(old, "ndim", 0) > 0
+    declared = isinstance(system, System) and system.parameter(name).is_number
+    if not (declared or old is None or (jax.tree_util.all_leaves([old]) and not listed and not isinstance(old, str))):
+        kind = "an array" if hasattr(old, "ndim") else f"a {type(old).__name__}"
+        allowed = f'one entry, for example "{name}[0]"' if listed else "a number"
+        raise InputError(f"over.{name}: {kind} cannot vary as a whole; allowed is {allowed}")
+    return value
+
+
 def _with_entry(old: Any, entry: int, value: Array, name: str) -> Any:
     """``old``, an array, list or tuple, with one number replaced."""
     base = entry_of(name)[0]
-    if not _is_listed(old):
+    if not (isinstance(old, (list, tuple)) or getattr(old, "ndim", 0) > 0):
         raise InputError(f"over.{name}: {base} is not a list; allowed is {base}")
     if entry >= len(old):
         allowed = f"allowed is {base}[0] to {base}[{len(old) - 1}]" if len(old) else f"{base} is empty"
         raise InputError(f"over.{name}: {allowed}")
-    _check_number(old[entry], name)
     if isinstance(old, (list, tuple)):
         return eqx.tree_at(lambda entries: entries[entry], old, value, is_leaf=lambda x: x is None)
     return jnp.asarray(old, jnp.result_type(old, value)).at[entry].set(value)
-
-
-def _is_listed(value: Any) -> bool:
-    return isinstance(value, (list, tuple)) or getattr(value, "ndim", 0) > 0
-
-
-def _check_number(old: Any, name: str) -> None:
-    """Check that a number in the place of ``old`` keeps the structure of the pytree."""
-    listed = _is_listed(old)
-    if old is None or (jax.tree_util.all_leaves([old]) and not listed and not isinstance(old, str)):
-        return
-    kind = "an array" if hasattr(old, "ndim") else f"a {type(old).__name__}"
-    allowed = f'one entry, for example "{name}[0]"' if listed and name == entry_of(name)[0] else "a number"
-    raise InputError(f"over.{name}: {kind} cannot vary as a whole; allowed is {allowed}")

@@ -46,7 +46,11 @@ def with_parameters(
     known = _known(system, axes, zipped, fixed)
     everything = physical.all_converted(known)
     found = {name: value for name, value in everything.items() if name not in physical.names}
-    constant = {name: _first(value) for name, value in found.items() if not isinstance(value, Along)}
+    constant = {
+        name: checked(system.parameter(name), _first(value), "fixed.")
+        for name, value in found.items()
+        if not isinstance(value, Along)
+    }
     others = {name: value for name, value in fixed.items() if name not in physical.names}
     data = {name: value for name, value in {**fixed, **everything}.items() if name in physical.names}
     return _converted_axes(system, axes, zipped, swept, found), others | constant, data
@@ -100,7 +104,7 @@ def _joined(columns: list[Axis], given: list[Axis]) -> list[Axis]:
 def _first(value: Any) -> Any:
     """A list without the entries that vary: the first value stands for them."""
     if isinstance(value, tuple):
-        return tuple(_first(entry) for entry in value)
+        return [_first(entry) for entry in value]
     return float(value.values[0]) if isinstance(value, Along) else value
 
 

@@ -25,7 +25,6 @@ from drivetrain_jax.runs.axes import (
     MAX_RANGES,
     Axis,
     AxisTable,
-    WrittenAxis,
     check_count,
     entry_of,
     in_units,
@@ -241,7 +240,7 @@ def _fixed(
     used, missing = analysis.model(system).parameters, []
     for parameter in system.parameters:
         if parameter.name in given:
-            fixed[parameter.name] = checked(parameter, _listed(given[parameter.name]), "fixed.")
+            fixed[parameter.name] = given[parameter.name]
         elif parameter.name in used and parameter.name not in whole and not parameter.derived:
             fixed[parameter.name] = parameter.default
             missing += [parameter] if parameter.default is None else []
@@ -255,10 +254,6 @@ def _fixed(
             _check_entry(part, fixed, where)
     _check_together(analysis.model(system), fixed)
     return fixed
-
-
-def _listed(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
 
 
 def _check_together(model: Model, fixed: Mapping[str, Value]) -> None:
@@ -354,19 +349,17 @@ def _axis_table(system: type[System], parameter: Parameter, name: str, given: An
     if isinstance(num := given.get("num"), float) and num.is_integer():
         # Options and parameters also accept 1e3 for 1000.
         given = {**given, "num": int(num)}
-    spec = toml.converted(given, WrittenAxis, f"axes.{name}.")
-    return in_units(spec, parameter, keep=_is_physical(system, name))
+    table = toml.converted(given, AxisTable, f"axes.{name}.")
+    return in_units(table, parameter, "axes.", keep=_is_physical(system, name))
 
 
 def _is_physical(system: type[System], name: str) -> bool:
     return system.physical is not None and entry_of(name)[0] in system.physical.names
 
 
-def _axis(name: str, spec: AxisTable, scalar: Parameter) -> Axis:
+def _axis(name: str, table: AxisTable, scalar: Parameter) -> Axis:
     base, entry = entry_of(name)
-    for value in spec.values if spec.values is not None else (spec.start, spec.stop):
-        checked(scalar, value, "axes.")
-    values = spread(spec, f"axes.{name}")
+    values = spread(table, f"axes.{name}")
     if scalar.integer:
         for value in values:
             checked(scalar, float(value), "axes.")
@@ -384,10 +377,8 @@ def _points(points: Mapping[str, Any], system: type[System], swept: Mapping[str,
         raise InputError(f"points: {listed}; allowed are lists of one length, at least 1")
     columns = []
     for name, values in points.items():
-        for value in values:
-            checked(swept[name], value, "points.")
-        spec, scalar = in_units(WrittenAxis(values=values), swept[name], keep=_is_physical(system, name))
-        numbers, (base, entry) = np.array(spec.values, np.int64 if scalar.integer else float), entry_of(name)
+        table, scalar = in_units(AxisTable(values=values), swept[name], "points.", keep=_is_physical(system, name))
+        numbers, (base, entry) = np.array(table.values, np.int64 if scalar.integer else float), entry_of(name)
         columns.append(Axis(name, replace(scalar, name=base), entry, numbers))
     return tuple(columns)
 

@@ -230,7 +230,7 @@ def change(old, new):
 WRONG_RUNS = {
     "unknown key": (change("[fixed]", "colour = 1\n[fixed]"), [], "axes.colour"),
     "unknown table": (change("[fixed]", "[fixd]"), [], "fixd"),
-    "missing key": (change('system = "toy"', ""), [], "system: missing"),
+    "missing key": (change('system = "toy"', ""), [], "missing required field `system`"),
     "missing parameter": (change("[axes]\na = { start = 0.0, stop = 10.0, num = 21 }", ""), [], "fixed.a: missing"),
     "unknown parameter": (change("b = 2.0", "bb = 2.0"), [], "fixed.bb"),
     "wrong type": (change("b = 2.0", 'b = "two"'), [], "b = 'two'"),
@@ -319,8 +319,8 @@ def test_wrong_run_is_one_line_and_writes_nothing(cli, folder, case):
         (("point", "toy", "toy", "a"), "name=value"),
         (("point", "toy", "toy", "a=11"), "a = 11"),
         (("point", "toy", "toy", "a=1", "outputs=nothing"), "nothing"),
-        (("point", "toy", "toy", "a=1", "outputs=5"), "outputs = 5: allowed is list"),
-        (("point", "toy", "toy", "a=1", "outputs=true"), "outputs = True: allowed is list"),
+        (("point", "toy", "toy", "a=1", "outputs=5"), "outputs = 5: expected `array"),
+        (("point", "toy", "toy", "a=1", "outputs=true"), "outputs = True: expected `array"),
         (("point", "toy", "toy", "a=1", "system=toy"), "system = 'toy': given twice"),
         (("point", "toy", "toy", "a=1", "analysis=toy"), "analysis = 'toy': given twice"),
         (
