@@ -92,12 +92,6 @@ class Output:
         except OSError as error:
             raise self._error(f"{error.strerror} (with '.parts'); allowed is a shorter name") from None
 
-    def check_writable(self) -> None:
-        """Raise :class:`InputError` if the folder of the result is not writable."""
-        for folder in (self.out.parent, self.parts.path):
-            if folder.exists() and not os.access(folder, os.W_OK | os.X_OK):
-                raise self._error(f"the folder {str(folder)!r} is not writable; allowed is a file in a writable folder")
-
     def _digest(self) -> str | None:
         """Digest of the present result; None without one, empty if the metadata of a store are damaged."""
         if not self.out.exists():

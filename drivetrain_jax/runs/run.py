@@ -7,13 +7,11 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
-from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax._machine import physical_memory
-from drivetrain_jax._wording import shown
 from drivetrain_jax.runs.assemble import ZarrBlocks
 from drivetrain_jax.runs.job import Job, resolve
 from drivetrain_jax.runs.output import HDF5, ZARR, Output
@@ -80,8 +78,6 @@ def run(
     2
     """
     executor = make_executor(threads, workers, dask)
-    if out is not None and not isinstance(out, (str, PathLike)):
-        raise InputError(f"out = {shown(out)}: allowed is the path of a file")
     if out is None and reuse:
         raise InputError("reuse: given without out; allowed is a run into a file")
     with shown_progress(report) as show:
@@ -119,10 +115,10 @@ def run_to_file(
         return progress
     if not fresh and output.state == "stale":
         raise output.refusal
-    output.check_writable()
     executor = executor or Threads()
     executor.check()
-    return _into(output, output.reused_points(_paths(reuse), fresh), fresh, executor, report)
+    paths = [reuse] if isinstance(reuse, (str, Path)) else reuse
+    return _into(output, output.reused_points(paths, fresh), fresh, executor, report)
 
 
 def _store(out: Path, given: str | None) -> str:
@@ -132,13 +128,6 @@ def _store(out: Path, given: str | None) -> str:
         allowed = f"allowed is a name such as {out.stem}.nc, or `drivetrain run --store zarr`"
         raise InputError(f"out = {str(out)!r}: names a Zarr store; {allowed}")
     return given or (ZARR if named else HDF5)
-
-
-def _paths(reuse: str | Path | Sequence[str | Path]) -> Sequence[str | Path]:
-    paths = [reuse] if isinstance(reuse, (str, Path)) else reuse
-    if not isinstance(paths, Sequence) or not all(isinstance(path, (str, Path)) for path in paths):
-        raise InputError(f"reuse = {shown(reuse)}: allowed is the path of a result, or a list of them")
-    return paths
 
 
 def _into(output: Output, reused: ReusedPoints, fresh: bool, executor: Threads, report: Report | None) -> Progress:

@@ -28,12 +28,10 @@ from drivetrain_jax.runs.job import Block, Chunk, Job, Results
 from drivetrain_jax.runs.reuse import NO_REUSE, ReusedPoints
 from drivetrain_jax.store.consolidate import Labelled, ResultFile
 
-# Most threads or processes, unless four a core are more.
-_MOST = 64
 # Tasks per worker: one is computed while the other waits, so no worker idles during writing.
 IN_FLIGHT = 2
-# Upper limits of queued chunks and of their bytes of results per thread: small chunks are computed faster than collected.
-_MOST_AHEAD, _BYTES_AHEAD = 32, 1 << 23
+# Chunks per thread: small ones are computed faster than collected.
+_CHUNKS_IN_FLIGHT = 8
 
 # Seconds until a scheduler has answered. A busy one may answer late.
 _ANSWERED = 10.0
@@ -150,31 +148,22 @@ def run_threads(
     remaining = iter(tasks)
     running: dict[Future[Results], Any] = {}
     finished: SimpleQueue[Future[Results]] = SimpleQueue()
-    ahead = IN_FLIGHT
     try:
         while True:
-            while len(running) < ahead * count and (task := next(remaining, None)) is not None:
+            while len(running) < _CHUNKS_IN_FLIGHT * count and (task := next(remaining, None)) is not None:
                 future = pool.submit(work, task)
                 running[future] = task
                 future.add_done_callback(finished.put)
             if not running:
                 return
             future = finished.get()
-            results = future.result()
-            ahead = _ahead(results)
-            yield running.pop(future), results
+            yield running.pop(future), future.result()
     finally:
         if running:
             for future in running:
                 future.cancel()
             # The next user of the pool must not wait for running tasks.
             threads.cache_clear()
-
-
-def _ahead(results: Results) -> int:
-    """Number of tasks like that of ``results`` to queue per thread."""
-    size = sum(values.nbytes for values in results.values())
-    return min(max(_BYTES_AHEAD // max(size, 1), IN_FLIGHT), _MOST_AHEAD)
 
 
 class Mismatch(ChunkError):
@@ -316,8 +305,6 @@ def make_executor(threads: int | None = None, workers: int | None = None, dask: 
         is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
         if value is not None and not (is_integer and value >= 1):
             raise InputError(f"{name} = {shown(value)}: allowed is {name} >= 1, an integer")
-        if value is not None and value > (most := max(_MOST, 4 * usable_cores())):
-            raise InputError(f"{name} = {value}: allowed is {name} <= {most}, because more only wait for a core")
     if dask is not None and not re.match(r"local:[1-9]\d*$|\w+://", str(dask)):
         raise InputError(f"dask = {dask!r}: allowed is tcp://HOST:PORT or local:N with N >= 1")
     settings = {"threads": threads, "workers": workers, "dask": dask}

@@ -155,31 +155,24 @@ LIBVER = ("v110", "v110")
 _COMPLEX = {"complex64": "_PFNC_FLOAT_COMPLEX_TYPE", "complex128": "_PFNC_DOUBLE_COMPLEX_TYPE"}
 
 
-def head(result: Labelled) -> bytes:
-    """The bytes of a file with all of ``result`` except its data: attributes, dimensions and coordinates."""
-    aside = _aside(result)
-    with h5py.File("head", "w", driver="core", backing_store=False, track_order=True, libver=LIBVER) as file:
-        file.attrs["_NCProperties"] = np.bytes_(_MADE_BY)
-        details = {name: value for name, value in result.attrs.items() if name in DETAILS}
-        shown = {name: value for name, value in result.attrs.items() if name not in DETAILS}
-        _set(file, {**shown, **_coordinates(sorted(aside))})
-        if details:
-            _set(file.create_group(GROUP, track_order=True), details)
-        for name, entry in result.coords.items():
-            _create(file, name, entry, data=entry.values.astype(_type(entry.values), copy=False))
-        scales = {d: _make_scale(file, d, number, size) for number, (d, size) in enumerate(result.sizes.items())}
-        for name, entry in aside.items():
-            _link(cast(h5py.Dataset, file[name]), entry, scales)
-        file.flush()
-        return file.id.get_file_image()
-
-
-def add_data(file: h5py.File, result: Labelled) -> dict[str, int]:
-    """Reserve blank space for the data of ``result`` in the ``file`` with its head; returns its position.
+def _write(file: h5py.File, result: Labelled) -> dict[str, int]:
+    """Write all of ``result`` but its data, for which space is reserved; returns the positions of the data.
 
     Empty variables get position 0. Scalars are written.
     """
-    scales, aside = {dim: cast(h5py.Dataset, file[dim]) for dim in result.sizes}, _aside(result)
+    details = {name: value for name, value in result.attrs.items() if name in DETAILS}
+    shown = {name: value for name, value in result.attrs.items() if name not in DETAILS}
+    # Auxiliary coordinates, which a reader cannot find through the dimensions of a variable (CF, 5).
+    sizes = result.sizes
+    aside = {name: entry for name, entry in result.coords.items() if name not in sizes}
+    _set(file, {**shown, **_coordinates(sorted(aside)), "_NCProperties": np.bytes_(_MADE_BY)})
+    if details:
+        _set(file.create_group(GROUP, track_order=True), details)
+    for name, entry in result.coords.items():
+        _create(file, name, entry, data=entry.values.astype(_type(entry.values), copy=False))
+    scales = {dim: _make_scale(file, dim, number, size) for number, (dim, size) in enumerate(sizes.items())}
+    for name, entry in aside.items():
+        _link(cast(h5py.Dataset, file[name]), entry, scales)
     for kind in sorted({str(entry.values.dtype) for entry in result.data.values()} & _COMPLEX.keys()):
         file[_COMPLEX[kind]] = np.dtype(kind)
     places = {}
@@ -245,12 +238,6 @@ def _set(owner: h5py.HLObject, attrs: Mapping[str, Any]) -> None:
         owner.attrs[name] = value if isinstance(value, str) else np.atleast_1d(value)
 
 
-def _aside(result: Labelled) -> dict[str, Entry]:
-    """Auxiliary coordinates, which a reader cannot find through the dimensions of a variable (CF, 5)."""
-    sizes = result.sizes
-    return {name: result.coords[name] for name in result.coords if name not in sizes}
-
-
 def _coordinates(names: Sequence[str]) -> dict[str, str]:
     return {"coordinates": " ".join(names)} if names else {}
 
@@ -313,15 +300,21 @@ def write_result(result: Labelled, path: Path, temporary: Path, preface: bytes =
 def _write_frame(template: Labelled, path: Path, preface: bytes) -> Mapping[str, int]:
     """Write everything except the data, whose contiguous space stays blank; returns the positions of the data.
 
-    The head is built in memory with reserved space for later additions, because HDF5 may crash the process on a full disk.
+    Space is reserved before anything is written, because HDF5 may crash the process on a full disk.
     """
-    content = (preface.ljust(_USER_BLOCK, b"\0") if preface else b"") + head(template)
+    with h5py.File("head", "w", driver="core", backing_store=False, track_order=True, libver=LIBVER) as file:
+        file.flush()
+        head = (preface.ljust(_USER_BLOCK, b"\0") if preface else b"") + file.id.get_file_image()
     # A pipe of this name would wait for a reader.
     path.unlink(missing_ok=True)
-    path.write_bytes(content)
-    _reserve(path, len(content) + sum(entry.values.nbytes + _LABELS for entry in template.data.values()))
+    path.write_bytes(head)
+    entries = [*template.coords.values(), *template.data.values()]
+    _reserve(
+        path,
+        sum(entry.values.nbytes + _LABELS for entry in entries) + sum(len(str(x)) for x in template.attrs.values()),
+    )
     with h5py.File(path, "r+", libver=LIBVER) as file:
-        places = add_data(file, template)
+        places = _write(file, template)
         checksums.reserve(file)
     _reserve(path, path.stat().st_size)
     return places

@@ -109,6 +109,8 @@ class PartsFolder:
                 raise InputError(f"out = {str(self.path)!r}: another run is working on it; wait or stop it") from None
             except FileNotFoundError:
                 continue
+            except PermissionError:
+                raise InputError(f"out = {str(self.path)!r}: not writable; allowed is to move it away") from None
             # Another run may have removed the folder between mkdir and lock.
             if os.path.exists(file):
                 self._lock = lock

@@ -349,11 +349,15 @@ def test_a_run_that_ends_between_check_and_lock_is_noticed(grid_scene, tmp_path,
 def test_a_finished_result_in_a_folder_without_write_permission_is_read(grid_scene, tmp_path, monkeypatch):
     path = tmp_path / "r.nc"
     run_to_file(grid_scene, path)
-    monkeypatch.setattr("drivetrain_jax.runs.output.os.access", lambda *_: False)
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("drivetrain_jax.store.parts.Path.mkdir", refuse)
     assert run_to_file(grid_scene, path).reused == 123 and status(grid_scene, path).state == "complete"
     assert_same(dt.run(grid_scene, path), dt.run(grid_scene))
     for fresh, name in ((True, "r.nc"), (False, "new.nc")):
-        with pytest.raises(dt.InputError, match="not writable"):
+        with pytest.raises(dt.InputError, match="allowed is a path in a writable folder"):
             run_to_file(grid_scene, tmp_path / name, fresh=fresh)
     assert os.listdir(tmp_path) == ["r.nc"]
 
