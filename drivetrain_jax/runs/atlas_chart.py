@@ -183,43 +183,34 @@ def _stored_curves(
         "code": source_digest({"atlas_chart.py": Path(__file__)}),
     }
     identity = program_identity(system, floquet, content) if known else ""
-    trace = partial(_curves_of_slices, slices=slices) if slices else _curves
-    return remembered(partial(trace, atlas, fixed, ranges), identity)
+    return remembered(partial(_curves, atlas, fixed, ranges, slices), identity)
 
 
 def _curves(
-    atlas: StoredAtlas, fixed: Mapping[str, float], ranges: Mapping[str, tuple[float, float]]
-) -> dict[str, tuple[str | tuple[str, str], np.ndarray, dict[str, str]]]:
-    system = atlas.scene.system
-    panels = narrow(atlas.stability.atlas.slice(fixed), ranges)
-    signs = _signs(panels)
-    tips = None
-    if system.resonances is not None and system.resonances.axis in ranges:
-        # Tongues open at their tips with increasing angle, and close there with increasing damping.
-        tips = find_tips(panels, system, opening=system.roles.get("angle") in ranges)
-    curves = _boundary(panels, system, ranges, tips.searches if tips else ())
-    coordinates = _labelled(system, curves)
-    if tips is None:
-        return coordinates
-    return coordinates | _tips(_on_all_sides(tips, signs, ranges), system, ranges)
-
-
-def _curves_of_slices(
     atlas: StoredAtlas,
     fixed: Mapping[str, float],
     ranges: Mapping[str, tuple[float, float]],
     slices: Mapping[str, np.ndarray],
-) -> dict[str, tuple]:
-    """The boundaries over ``ranges`` for every combination of the values of ``slices``, padded with NaN to one length."""
-    whole, system = atlas.stability.atlas, atlas.scene.system
-    parts = [whole.slice({**fixed, **dict(zip(slices, point, strict=True))}) for point in product(*slices.values())]
-    found = [_boundary(narrow(part, ranges), system, ranges) for part in parts]
+) -> dict[str, tuple[str | tuple[str, ...], np.ndarray, dict[str, str]]]:
+    """The boundaries over ``ranges`` for every combination of the values of ``slices``, padded with NaN to one length.
+
+    Without slices there are the tips, too.
+    """
+    whole, system, tips = atlas.stability.atlas.slice(fixed), atlas.scene.system, None
+    if not slices and system.resonances is not None and system.resonances.axis in ranges:
+        # Tongues open at their tips with increasing angle, and close there with increasing damping.
+        tips = find_tips(narrow(whole, ranges), system, opening=system.roles.get("angle") in ranges)
+    parts = [narrow(whole.slice(dict(zip(slices, point, strict=True))), ranges) for point in product(*slices.values())]
+    found = [_boundary(part, system, ranges, tips.searches if tips else ()) for part in parts]
     shape = (*map(len, slices.values()), max(curve[name].size for curve in found for name in ranges))
-    padded = {name: np.full(shape, np.nan) for name in ranges}
-    for place, curve in zip(np.ndindex(shape[:-1]), found, strict=True):
-        for name, values in curve.items():
-            padded[name][place][: values.size] = values
-    return _labelled(system, padded, *slices)
+    coordinates: dict[str, tuple] = {}
+    for name in ranges:
+        padded = np.full(shape, np.nan)
+        for place, curve in zip(np.ndindex(shape[:-1]), found, strict=True):
+            padded[place][: curve[name].size] = curve[name]
+        about = {"units": system.parameter(name).units, "long_name": f"boundary of stability, {name}"}
+        coordinates[f"boundary_{name}"] = ((*slices, "boundary"), padded, about)
+    return coordinates | (_tips(_on_all_sides(tips, _signs(parts[0]), ranges), system, ranges) if tips else {})
 
 
 def _boundary(
@@ -233,15 +224,6 @@ def _boundary(
         for side in _signs(panels)
     ]
     return {name: np.concatenate([np.empty(0), *(np.append(s[name], np.nan) for s in segments)]) for name in ranges}
-
-
-def _labelled(system: type[System], curves: Mapping[str, np.ndarray], *dims: str) -> dict[str, tuple]:
-    """Points of ``curves`` as coordinates along ``dims`` and ``boundary``."""
-    coordinates: dict[str, tuple] = {}
-    for name, values in curves.items():
-        about = {"units": system.parameter(name).units, "long_name": f"boundary of stability, {name}"}
-        coordinates[f"boundary_{name}"] = ((*dims, "boundary"), values, about)
-    return coordinates
 
 
 def _signs(atlas: Atlas) -> list[dict[str, float]]:

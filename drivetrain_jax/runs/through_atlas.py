@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -31,8 +30,9 @@ from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.reuse import ReusedPoints
 from drivetrain_jax.runs.scene import Problem, Ranges, Scene
 from drivetrain_jax.runs.work import DIRECT, Progress, Route, Work
+from drivetrain_jax.store.parts import Shards
 
-# Cells evaluated at a time; determines memory and the interval of progress reports.
+# Cells evaluated at a time, which determines memory and the interval of progress reports, and rows of a tile.
 _BLOCK = 1 << 21
 _ROWS = 64
 # Cells above which preparations run in parallel with the solves.
@@ -139,7 +139,8 @@ def _blocks(job: Job, atlas: StabilityAtlas, buffer: ResultBuffer) -> Iterator[t
     atlas = atlas.ordered(sorted(lengths, key=lambda name: (name in longest, name not in longest and lengths[name])))
     names, outputs = atlas.atlas.parameters, job.scene.request.outputs
     sizes = [lengths[name] for name in names]
-    for ranges in _cut(sizes):
+    boxes = _boxes(tuple(sizes))
+    for ranges in map(boxes.place, range(boxes.count)):
         values = [axes[name][part] for name, part in zip(names, ranges, strict=True)]
         place = tuple(dict(zip(names, ranges, strict=True)).get(name, slice(0, 1)) for name in axes)
         arrays = buffer.block(place, atlas.blank((), outputs))
@@ -154,19 +155,13 @@ def _single(axes: Mapping[str, np.ndarray], parameters: Sequence[str]) -> list[s
     return single[: max(len(parameters) - 2, 0)]
 
 
-def _cut(lengths: Sequence[int]) -> Iterator[tuple[slice, ...]]:
-    """Yield blocks of at most about ``_BLOCK`` cells of a grid, whole along as many of the last axes as possible."""
-    whole = len(lengths) - 1
-    while whole > 0 and math.prod(lengths[whole:]) <= _BLOCK:
-        whole -= 1
-    # Axis number `whole` is cut into pieces, earlier axes into single values.
-    step = max(1, _BLOCK // max(math.prod(lengths[whole + 1 :]), 1))
-    step = step - step % _ROWS if step > _ROWS else step
-    starts = list(range(0, lengths[whole], step))
-    pieces = [slice(*ends) for ends in itertools.pairwise([*starts, lengths[whole]])]
-    for leading in itertools.product(*(range(n) for n in lengths[:whole])):
-        for piece in pieces:
-            yield (*(slice(i, i + 1) for i in leading), piece, *(slice(0, n) for n in lengths[whole + 1 :]))
+def _boxes(sizes: tuple[int, ...]) -> Shards:
+    """Boxes of about ``_BLOCK`` cells, with whole tiles of rows."""
+    boxes = Shards.of(sizes, None, _BLOCK)
+    if len(sizes) == 1 or boxes.lengths[-2] < _ROWS:
+        return boxes
+    *outer, rows, columns = boxes.lengths
+    return replace(boxes, lengths=(*outer, min(-(-rows // _ROWS) * _ROWS, sizes[-2]), columns))
 
 
 def _in_atlas_order(values: np.ndarray, names: Sequence[str], axes: Sequence[str]) -> np.ndarray:
