@@ -137,26 +137,18 @@ def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapp
         raise InputError(re.sub(r"^(fixed|options)\.", "", str(error))) from None
     along = analysis.path_axis(type(system), request)
     leaf = None if along is None else path_entry(values, along)
-    path = None if along is None else _path(along, leaf)
+    if along is not None and isinstance(leaf, jax.core.Tracer):
+        raise InputError(
+            f"{along}: a traced array; allowed for the path that the analysis follows are concrete numbers"
+        )
+    path = None if along is None else np.atleast_1d(np.asarray(leaf, float))
     parameters = jax.tree.map(lambda x: None if isinstance(x, str) or x is leaf else jnp.asarray(x, float), values)
-    _check_scalars(name, parameters)
+    if batch := next((x.shape for x in jax.tree.leaves(parameters) if x.ndim), None):
+        allowed = "allowed is one system, or a batch under jax.vmap"
+        raise InputError(f"{name}: parameters of the shape {batch}; {allowed}")
     rest = jax.tree.map(lambda x: x if isinstance(x, str) else path if x is leaf else None, values)
     single = along is not None and np.ndim(leaf) == 0  # pyright: ignore[reportArgumentType]
     return _Job(analysis, type(system), request, Constants(rest), along is not None, single, dimensions), parameters
-
-
-def _check_scalars(name: str, parameters: Any) -> None:
-    for x in jax.tree.leaves(parameters):
-        if x.ndim:
-            raise InputError(
-                f"{name}: parameters of the shape {x.shape}; allowed is one system, or a batch under jax.vmap"
-            )
-
-
-def _path(name: str, values: Any) -> np.ndarray:
-    if isinstance(values, jax.core.Tracer):
-        raise InputError(f"{name}: a traced array; allowed for the path that the analysis follows are concrete numbers")
-    return np.atleast_1d(np.asarray(values, float))
 
 
 def _concrete(job: _Job, parameters: Any) -> dict[str, Array]:

@@ -59,11 +59,6 @@ class ResultBuffer:
         self._unreleased = 0
         self.arrays: Mapping[str, np.ndarray] = {}
 
-    @property
-    def on_disk(self) -> bool:
-        """True if the values are in a file, not in memory."""
-        return self._allocate is not None
-
     def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
         """Write the results of ``points``."""
         self._lay_out_for(results)

@@ -298,7 +298,7 @@ class Output:
                 return int(self.attribute("solves")), np.empty(0, OUTCOME.dtype)
             except (TypeError, ValueError):
                 raise self._error("no atlas has these attributes; --fresh replaces it") from None
-        read = zarr_store.read_variable if self.store == ZARR else consolidate.read_variable
+        read = zarr_store.read_variable if self.store == ZARR else consolidate.map_variable
         return self.job.total, read(self.out, OUTCOME.name)
 
 

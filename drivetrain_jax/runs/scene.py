@@ -31,7 +31,7 @@ from drivetrain_jax.runs.axes import (
     spread,
 )
 from drivetrain_jax.runs.physical import described, with_parameters
-from drivetrain_jax.systems import Model, System, get_system, system_names
+from drivetrain_jax.systems import System, get_system, system_names
 
 Value = float | int | str | tuple[float, ...]
 Ranges = dict[str, tuple[float, float]]
@@ -163,8 +163,10 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
     fixed = _fixed(system, analysis, axes, given, "points" if table.points else "axes")
     title = table.title or f"{system.title}: {analysis.title}"
     scene = Scene(system, analysis, request, axes, zipped, fixed, title, text, data)
-    if analysis.continuous:
-        _check_single(scene)
+    if several := next((axis for axis in axes if axis.also and analysis.continuous), None):
+        names = ", ".join(part.name for part in several.together)
+        allowed = "allowed in an atlas is one: fix the others in place of their data"
+        raise InputError(f"axes.{several.shown.name}: changes {names} together; {allowed}")
     _check_path(scene)
     # The analysis checks that request and parameters match.
     _ = scene.dimensions
@@ -208,15 +210,6 @@ def system_and_analysis(system_name: str, analysis_name: str) -> tuple[type[Syst
     return system, analysis.for_system(system)
 
 
-def _check_single(scene: Scene) -> None:
-    """Check that every range changes one parameter."""
-    for axis in scene.axes:
-        if axis.also:
-            names = ", ".join(part.name for part in axis.together)
-            allowed = "allowed in an atlas is one: fix the others in place of their data"
-            raise InputError(f"axes.{axis.shown.name}: changes {names} together; {allowed}")
-
-
 def _given(table: _SceneTable, system: type[System], axes: tuple[Axis, ...]) -> dict[str, Any]:
     """The checked values of ``[fixed]``, parameters and physical data."""
     known = described(system)
@@ -252,17 +245,12 @@ def _fixed(
     for axis in axes:
         for part in axis.together:
             _check_entry(part, fixed, where)
-    _check_together(analysis.model(system), fixed)
+    if check := analysis.model(system).check:
+        try:
+            check(fixed)
+        except ValueError as error:
+            raise InputError(f"fixed.{error}") from None
     return fixed
-
-
-def _check_together(model: Model, fixed: Mapping[str, Value]) -> None:
-    if model.check is None:
-        return
-    try:
-        model.check(fixed)
-    except ValueError as error:
-        raise InputError(f"fixed.{error}") from None
 
 
 def _check_path(scene: Scene) -> None:

@@ -57,12 +57,11 @@ class ThroughAtlas(Route):
         solves = Progress(0, kind="direct solves for the atlas")
         # In parallel with the solves.
         with ThreadPoolExecutor(1, initializer=in_double_precision) as aside:
-            prepared = [aside.submit(_lay_out, job, buffer), aside.submit(self._prepare_judging, job)]
+            prepared = aside.submit(self._prepare_judging, job)
             atlas, first = build_atlas(job.scene, self._ranges, work, solves, self._max_solves)
             progress.note = solves.note
-            prepared[0].result()
             uncovered = evaluate(job, buffer, atlas, work, progress, first)
-            prepared[1].result()
+            prepared.result()
         panels = len(atlas.atlas.panels)
         return {"atlas_solves": atlas.atlas.solves, "atlas_panels": panels, "atlas_uncovered": uncovered}
 
@@ -73,15 +72,6 @@ class ThroughAtlas(Route):
         scene = job.scene
         fixed, rtol = fixed_of(scene, self._ranges), scene.request.options["rtol"]
         prepare_judging(scene.system, self._ranges, fixed, rtol, scene.request.outputs)
-
-
-def _lay_out(job: Job, buffer: ResultBuffer) -> None:
-    """Create a large output file while the solves run; for a small file this would delay the solves.
-
-    The thread that fills memory must also allocate it, to reuse memory that earlier results have freed.
-    """
-    if job.grid.size >= _LARGE and buffer.on_disk and not any(variable.dims for variable in buffer.variables):
-        buffer.lay_out()
 
 
 def evaluate(

@@ -83,14 +83,19 @@ class Labelled:
         without values is numbered from 1.
         """
         results = list(results)
-        coords = {c.name: Entry(c.dims, c.values, _coordinate_attrs(c)) for c in coordinates}
+        coords = {}
+        for c in coordinates:
+            named = {"parameter": c.parameter} if c.parameter else {}
+            coords[c.name] = Entry(c.dims, c.values, {"units": c.units, "long_name": c.long_name, **named})
         sizes = {d: n for v, values in results for d, n in zip(reversed(v.dims), reversed(values.shape), strict=False)}
         for d in dimensions:
             if d.name in sizes:
-                coords[d.name] = Entry((d.name,), np.asarray(d.labels(sizes[d.name])), _labels(d.units, d.long_name))
-        data = {
-            v.name: Entry((*sweep_dims, *v.dims), values, _variable_attrs(v), _fill(values)) for v, values in results
-        }
+                about = {"units": d.units, "long_name": d.long_name}
+                coords[d.name] = Entry((d.name,), np.asarray(d.labels(sizes[d.name])), about)
+        data = {}
+        for v, values in results:
+            fill = np.nan if values.dtype.kind == "f" else None
+            data[v.name] = Entry((*sweep_dims, *v.dims), values, _variable_attrs(v), fill)
         return cls(coords, data, attrs)
 
     @property
@@ -120,25 +125,13 @@ class Labelled:
         return dataset
 
 
-def _fill(values: np.ndarray) -> float | None:
-    return np.nan if values.dtype.kind == "f" else None
-
-
-def _labels(units: str, long_name: str) -> dict[str, Any]:
-    return {"units": units, "long_name": long_name}
-
-
-def _coordinate_attrs(coordinate: Coordinate) -> dict[str, Any]:
-    attrs = _labels(coordinate.units, coordinate.long_name)
-    return attrs | {"parameter": coordinate.parameter} if coordinate.parameter else attrs
-
-
 def _variable_attrs(variable: Variable) -> dict[str, Any]:
     """CF attributes; flag values have the type of the variable, as CF requires."""
-    attrs = _labels(variable.units, variable.long_name)
+    attrs: dict[str, Any] = {"units": variable.units, "long_name": variable.long_name}
     if ", " in variable.units:
         # CF allows one unit per variable.
-        attrs = _labels("1", f"{variable.long_name} [{variable.units}]") | {"units_of_components": variable.units}
+        about = f"{variable.long_name} [{variable.units}]"
+        attrs = {"units": "1", "long_name": about, "units_of_components": variable.units}
     if variable.flags:
         attrs["flag_values"] = np.arange(len(variable.flags), dtype=variable.dtype)
         attrs["flag_meanings"] = " ".join(flag.replace(" ", "_") for flag in variable.flags)
@@ -362,28 +355,20 @@ def layout(path: Path) -> dict[str, tuple[np.dtype, tuple[int, ...]]]:
         return {name: (each.dtype, each.shape) for name, each in file.items() if isinstance(each, h5py.Dataset)}
 
 
-def read_variable(path: Path, name: str) -> np.ndarray:
-    """One variable of the result at ``path``, without loading the others; ``InputError`` if it cannot be read."""
-    with opened(path) as file:
-        return _variable(file, name)[()]
-
-
-def _variable(file: h5py.File, name: str) -> h5py.Dataset:
-    variable = file[name]
-    if not isinstance(variable, h5py.Dataset):
-        raise TypeError(f"{name} is a {type(variable).__name__.lower()}, not a variable")
-    return variable
-
-
 def map_variable(path: Path, name: str) -> np.ndarray:
-    """Like :func:`read_variable`, but as a memory map where the storage of the variable allows that."""
+    """One variable of the result at ``path``, as a memory map where its storage allows that.
+
+    Raises :class:`InputError` if it cannot be read.
+    """
     with opened(path) as file:
-        variable = _variable(file, name)
+        variable = file[name]
+        if not isinstance(variable, h5py.Dataset):
+            raise TypeError(f"{name} is a {type(variable).__name__.lower()}, not a variable")
         # The words of a file are references, which only HDF5 can follow.
         plain = variable.chunks is None and not variable.dtype.hasobject
         if plain and (offset := variable.id.get_offset()) is not None and variable.size:
             return np.memmap(path, variable.dtype, "r", offset, variable.shape)
-    return read_variable(path, name)
+        return variable[()]
 
 
 def read_plain(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
