@@ -44,7 +44,7 @@ def describe(name: str) -> str:
     lines += aligned([_parameter_row(p) for p in system.parameters])
     if system.physical:
         lines += ["", 'Physical data, which parameters follow from; any number may have a unit: "18 deg", "1500 rpm"']
-        lines += aligned([_quantity_row(p) for p in system.physical.quantities])
+        lines += aligned([_parameter_row(p, "") for p in system.physical.quantities])
         lines += aligned([(c.parameter, f"= {c.formula}") for c in system.physical.conversions])
     if system.presets:
         lines += ["", "Presets, to copy into a scene"]
@@ -79,16 +79,11 @@ def _analysis_lines(name: str, system: type[System]) -> list[str]:
     return [*lines, "  Options", *("  " + line for line in aligned([_parameter_row(o) for o in analysis.options]))]
 
 
-def _parameter_row(parameter: Parameter) -> tuple[str, ...]:
+def _parameter_row(parameter: Parameter, required: str = "required") -> tuple[str, ...]:
     given = "none" if parameter.default in ((), "") else written(parameter.default)
-    default = "required" if parameter.default is None else f"default {given}"
+    default = required if parameter.default is None else f"default {given}"
     default = f"default {parameter.derived}" if parameter.derived else default
     return parameter.name, f"[{parameter.units}]", parameter.long_name, default, parameter.allowed
-
-
-def _quantity_row(quantity: Parameter) -> tuple[str, ...]:
-    default = "" if quantity.default is None else f"default {written(quantity.default)}"
-    return quantity.name, f"[{quantity.units}]", quantity.long_name, default, quantity.allowed
 
 
 def _variable_row(variable: Variable, default: bool) -> tuple[str, ...]:

@@ -145,20 +145,11 @@ def _parsed(stored: Any) -> dict[str, str]:
 
 def _of_variable(variable: h5py.Dataset) -> str:
     state = _of_attributes(variable, _LINKS)
-    dims = [_dimension(variable, axis) for axis in range(variable.ndim)]
+    dims = [scales[0].name if len(scales) else scales.label for scales in variable.dims]
     state.update(json.dumps([dims, variable.dtype.str, variable.shape, repr(variable.fillvalue)]).encode())
     for block in _blocks(variable):
         state.update(_bytes(block))
     return state.hexdigest()
-
-
-def _dimension(variable: h5py.Dataset, axis: int) -> str | None:
-    """Name of a dimension in the file, read from its first scale, because h5py would look it up three times."""
-    if not h5py.h5ds.get_num_scales(variable.id, axis):
-        return variable.dims[axis].label
-    scales: list[h5py.h5d.DatasetID] = []
-    h5py.h5ds.iterate(variable.id, axis, scales.append, 0)
-    return h5py.Dataset(scales[0]).name
 
 
 def _blocks(variable: h5py.Dataset) -> Iterator[np.ndarray]:
