@@ -300,8 +300,8 @@ def engine_job(scene: Mapping[str, Any], threads: int = 1, spent: np.ndarray | N
     This call compiles the kernels, unless another scene of the process shares them. ``spent`` takes the seconds of each
     point: those of its chunk, divided evenly.
     """
-    from drivetrain_jax.runs.job import resolve
     from drivetrain_jax.runs.kernel import kernel_of
+    from drivetrain_jax.runs.resolve import resolve
     from drivetrain_jax.runs.scene import load_scene
     from drivetrain_jax.runs.work import run_threads
 

@@ -90,7 +90,7 @@ PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "nump
 _ROOT = Path(drivetrain_jax.__file__).parent
 # Folders and files of this package that compute numbers, and the files in these folders that only read results.
 _FOLDERS = ("systems", "analysis", "atlas")
-_ENGINE = ("axes", "job", "kernel", "over", "through_atlas")
+_ENGINE = ("axes", "job", "kernel", "over", "resolve", "through_atlas")
 _FILES = ("_quantities", "functions", "resonances", "store/parts", *(f"runs/{name}" for name in _ENGINE))
 _READER = "figure.py"
 

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from drivetrain_jax._rules import BUILT_IN
 from drivetrain_jax.analysis import analysis_names, get_analysis
-from drivetrain_jax.runs.job import resolve
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import get_system, system_names
 

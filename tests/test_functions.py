@@ -20,8 +20,8 @@ from drivetrain_jax.analysis import OUTCOME, Outcome, get_analysis
 from drivetrain_jax.analysis.floquet import propagator
 from drivetrain_jax.analysis.request import make_request
 from drivetrain_jax.runs import kernel
-from drivetrain_jax.runs.job import resolve
 from drivetrain_jax.runs.kernel import compile_kernel, result_variables
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import LinearPeriodic, Smoothness, System, get_system, parameter, serves
 from tests.sizes import but_full

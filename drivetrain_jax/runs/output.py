@@ -27,7 +27,8 @@ from drivetrain_jax.runs.assemble import (
     stored_blocks,
     with_pending,
 )
-from drivetrain_jax.runs.job import Job, Results, resolve
+from drivetrain_jax.runs.job import Job, Results
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.reuse import (
     NO_REUSE,
     Damaged,

@@ -16,9 +16,10 @@ from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, get_
 from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range, orders_of
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
-from drivetrain_jax.runs.job import Job, resolve
+from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.physical import described
 from drivetrain_jax.runs.reply import Limit, Reply, growth_lines, growth_of, speed_in_rpm
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import Scene, load_scene, system_and_analysis
 
 

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax._machine import physical_memory
 from drivetrain_jax.runs.assemble import ZarrBlocks
-from drivetrain_jax.runs.job import Job, resolve
+from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.output import HDF5, ZARR, Output
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.reuse import ReusedPoints
 from drivetrain_jax.runs.scene import Scene, load_scene
 from drivetrain_jax.runs.work import Progress, Report, Threads, Work, make_executor

@@ -420,7 +420,7 @@ class Work:
 
 
 class Route:
-    """The way from a job to its result, chosen once by :func:`~drivetrain_jax.runs.job.resolve`: solves every point."""
+    """The way from a job to its result, chosen once by :func:`~drivetrain_jax.runs.resolve.resolve`: solves every point."""
 
     # Name of the route; a part of the digest, because the route affects the bits.
     name = "direct solves"

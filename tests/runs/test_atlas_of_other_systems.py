@@ -12,9 +12,9 @@ import xarray as xr
 
 import drivetrain_jax as dt
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.runs import job as job_module
+from drivetrain_jax.runs import resolve as resolve_module
 from drivetrain_jax.runs import scene
-from drivetrain_jax.runs.job import choose_atlas
+from drivetrain_jax.runs.resolve import choose_atlas
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System, parameter, serves
 
@@ -107,7 +107,7 @@ def test_an_integer_is_no_range_of_an_atlas(monkeypatch):
         load_scene(SCENE | {"axes": axes, "fixed": fixed})
     many = {"order": {"start": 1, "stop": 3, "num": 3}, "omega": {"start": 0.8, "stop": 1.2, "num": 400}}
     chart = {"system": "pendulum", "analysis": "floquet", "axes": many, "fixed": {"depth": 0.3}}
-    monkeypatch.setattr(job_module, "_WORTHWHILE", 0)
+    monkeypatch.setattr(resolve_module, "_WORTHWHILE", 0)
     assert choose_atlas(load_scene(chart)) is None
     with pytest.raises(InputError, match="order is an integer; allowed are auto and direct"):
         choose_atlas(load_scene(chart | {"options": {"method": "atlas"}}))

@@ -19,9 +19,10 @@ from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.atlas.criteria import Criteria, has_boundaries
 from drivetrain_jax.cli import main
 from drivetrain_jax.runs import atlas_answers, atlas_chart, through_atlas
-from drivetrain_jax.runs import job as job_module
+from drivetrain_jax.runs import resolve as resolve_module
 from drivetrain_jax.runs.atlas_chart import chart
-from drivetrain_jax.runs.job import Job, choose_atlas
+from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.resolve import choose_atlas
 from drivetrain_jax.runs.run import Incomplete, Interrupted, run_to_file
 from drivetrain_jax.runs.scene import load_scene
 from tests.atlases import atlas_file
@@ -134,15 +135,15 @@ def test_points_and_multipliers_through_an_atlas():
 
 def test_auto_uses_an_atlas_for_many_points(monkeypatch, direct):
     assert "atlas_solves" not in dt.run(floquet("auto")).attrs
-    monkeypatch.setattr(job_module, "_WORTHWHILE", 500)
+    monkeypatch.setattr(resolve_module, "_WORTHWHILE", 500)
     # An eighth of the effort of 533 points is that of some 30 solves, too few for an atlas of two parameters.
     assert "atlas_solves" not in dt.run(floquet("auto")).attrs
-    monkeypatch.setattr(job_module, "_FEWEST", (1, 1))
+    monkeypatch.setattr(resolve_module, "_FEWEST", (1, 1))
     found = dt.run(floquet("auto"))
     # A forced attempt stops at the first round, and all points are solved directly.
     assert found.attrs["atlas_uncovered"] == 533
     assert_same_arrays(found, direct)
-    monkeypatch.setattr(job_module, "_SHARE", 10.0)
+    monkeypatch.setattr(resolve_module, "_SHARE", 10.0)
     assert_agree(dt.run(floquet("auto")), direct)
 
 
@@ -150,7 +151,7 @@ def test_the_message_names_another_route_of_auto(monkeypatch, tmp_path):
     path = tmp_path / "r.nc"
     run_to_file(floquet("auto"), path)
     for name, value in (("_WORTHWHILE", 600), ("_FEWEST", (1, 1))):
-        monkeypatch.setattr(job_module, name, value)
+        monkeypatch.setattr(resolve_module, name, value)
     large = floquet("auto", floquet("auto")["axes"] | {"beta": {"start": BETA[0], "stop": BETA[1], "num": 25}})
     with pytest.raises(InputError, match="route is an atlas, was direct solves") as refused:
         run_to_file(large, path)

@@ -22,7 +22,8 @@ from drivetrain_jax.analysis.critical_speeds import frequency_roots as shaft_roo
 from drivetrain_jax.analysis.history import integration as history
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
 from drivetrain_jax.analysis.numerics import singular_values
-from drivetrain_jax.runs.job import Block, resolve
+from drivetrain_jax.runs.job import Block
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
 

@@ -20,7 +20,8 @@ import drivetrain_jax as dt
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.runs import toml, work
-from drivetrain_jax.runs.job import Block, resolve
+from drivetrain_jax.runs.job import Block
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.runs.work import Threads, make_executor, run_threads
 from drivetrain_jax.store.parts import BlockFiles

@@ -12,7 +12,8 @@ import toy
 
 import drivetrain_jax as dt
 from drivetrain_jax import _programs
-from drivetrain_jax.runs.job import resolve, scene_digest
+from drivetrain_jax.runs.job import scene_digest
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.store.files import source_digest
 

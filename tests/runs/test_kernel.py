@@ -14,7 +14,8 @@ import drivetrain_jax as dt
 from drivetrain_jax.analysis.numerics import kernels
 from drivetrain_jax.atlas import charts
 from drivetrain_jax.runs import kernel
-from drivetrain_jax.runs.job import Block, Job, resolve
+from drivetrain_jax.runs.job import Block, Job
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.runs.work import DIRECT
 

@@ -9,7 +9,8 @@ import toy
 from drivetrain_jax.analysis import Solver
 from drivetrain_jax.runs import job
 from drivetrain_jax.runs.axes import Grid
-from drivetrain_jax.runs.job import Block, block_size, chunk_size, make_plan, resolve
+from drivetrain_jax.runs.job import Block, block_size, chunk_size, make_plan
+from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.store.parts import Shards
 

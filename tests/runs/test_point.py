@@ -148,9 +148,9 @@ def test_another_point_needs_no_new_compilation():
         ({"a": 1, "knob": 2}, "^knob = 2: not used by method plain"),
         ({"a": 1, "kind": "odd"}, "^kind = 'odd'"),
         ({"a": 1, "outputs": ["nothing"]}, "^outputs: 'nothing'"),
-        ({"a": 1, "outputs": 5}, "^outputs = 5: allowed is list"),
-        ({"a": 1, "outputs": True}, "^outputs = True: allowed is list"),
-        ({"a": 1j}, "^a = 1j: allowed is text, a number"),
+        ({"a": 1, "outputs": 5}, "^outputs = 5: expected `array"),
+        ({"a": 1, "outputs": True}, "^outputs = True: expected `array"),
+        ({"a": 1j}, "^a = 1j: allowed is a number"),
     ],
 )
 def test_wrong_input_is_one_clear_line(given, part):
