@@ -17,6 +17,7 @@ from drivetrain_jax._machine import use_double_precision
 
 if TYPE_CHECKING:
     from drivetrain_jax.analyses import (
+        Result,
         basins,
         critical_speeds,
         floquet,
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
         steady_state,
     )
     from drivetrain_jax.datasets.figure import plot
-    from drivetrain_jax.functions import Result
     from drivetrain_jax.runs.atlas_file import open_atlas
     from drivetrain_jax.runs.output import open_result
     from drivetrain_jax.runs.over import sweep
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.2.0"
 
-# Modules of the names; all others are functions of `analyses`.
+# Modules of the names; all others are in `analyses`.
 _HOME = {
     "datasets.figure": ("plot",),
     "runs.atlas_file": ("open_atlas",),
@@ -60,7 +60,6 @@ _HOME = {
     "systems.planetary": ("Planetary",),
     "systems.rattle": ("Rattle",),
     "systems.tripod": ("Tripod",),
-    "functions": ("Result",),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 

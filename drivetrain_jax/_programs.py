@@ -91,7 +91,7 @@ _ROOT = Path(drivetrain_jax.__file__).parent
 # Folders and files of this package that compute numbers, and the files in these folders that only read results.
 _FOLDERS = ("systems", "analysis", "atlas")
 _ENGINE = ("axes", "job", "kernel", "over", "resolve", "through_atlas")
-_FILES = ("_quantities", "functions", "resonances", "store/parts", *(f"runs/{name}" for name in _ENGINE))
+_FILES = ("_quantities", "analyses", "resonances", "store/parts", *(f"runs/{name}" for name in _ENGINE))
 _READER = "figure.py"
 
 

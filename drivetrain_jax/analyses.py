@@ -1,13 +1,340 @@
-"""The analyses by name: ``floquet(shaft)`` and so on; each is :func:`~drivetrain_jax.functions.analyse` with its name."""
+"""The analyses as pure functions, such as ``floquet(shaft)``, under ``jax.jit``, ``jax.vmap`` and ``jax.grad``, too.
+
+A function takes one system, whose numbers may be traced, and returns a :class:`Result`, a pytree of the requested variables
+and ``outcome``. Concrete numbers are solved by the cheapest solver, as in a scene, traced numbers by the first one. Under
+``jax.vmap`` the kernels of a sweep solve all lanes, lanes of similar effort together. Derivatives are forward Jacobians
+contracted with the tangents, so forward and reverse mode both work. A missing derivative is NaN.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache, partial
 from typing import Any
 
-from drivetrain_jax.functions import Result, analyse
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.custom_batching import custom_vmap
+
+from drivetrain_jax import _programs
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._wording import did_you_mean
+from drivetrain_jax.analysis import OUTCOME, Analysis, Dimension, Outcome, Request, Solver, analyses_of, get_analysis
+from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
+from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lanes_last, path_entry
+from drivetrain_jax.analysis.request import checked_solvers, dimensions_of, make_request
 from drivetrain_jax.systems import System
+from drivetrain_jax.systems._base import printed
+
+# Lanes of similar effort that are solved together, and lanes whose program is compiled without optimisation.
+_TOGETHER, _FEW = 128, 128
+
+
+class Result(eqx.Module):
+    """The variables of one analysis and ``outcome``, by attribute or by name; a pytree of arrays.
+
+    Units and meanings: ``drivetrain list SYSTEM``.
+
+    >>> import drivetrain_jax as dt
+    >>> found = dt.modes(dt.Planetary(), outputs=["natural_frequency"])
+    >>> list(found), found["natural_frequency"].shape
+    (['natural_frequency', 'outcome'], (21,))
+    """
+
+    variables: dict[str, Array]
+
+    def __getattr__(self, name: str) -> Array:
+        if name.startswith("_") or name == "variables" or name not in self.variables:
+            raise AttributeError(f"no result {name!r}; there is {', '.join(vars(self).get('variables', ()))}")
+        return self.variables[name]
+
+    def __repr__(self) -> str:
+        return f"Result({', '.join(f'{name}={printed(x)}' for name, x in self.variables.items())})"
+
+    def __getitem__(self, name: str) -> Array:
+        return self.variables[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.variables)
+
+    def keys(self) -> Any:
+        """Names of the variables, so that ``dict(result)`` holds them."""
+        return self.variables.keys()
+
+    def __dir__(self) -> list[str]:
+        return sorted({*super().__dir__(), *self.variables})
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Everything about a call except its numbers: equal jobs share one compilation.
+
+    With ``single`` the path has one value and is not a dimension of the results.
+    """
+
+    analysis: Analysis
+    system: type[System]
+    request: Request
+    constants: Constants
+    path: bool
+    single: bool
+    dimensions: tuple[Dimension, ...]
+
+    def __hash__(self) -> int:
+        return hash((self.analysis.name, self.system, self.request.outputs, self.request.method, self.constants))
+
+    @property
+    def solvers(self) -> tuple[Solver, ...]:
+        """All solvers that a call can choose from."""
+        return checked_solvers(self.analysis, self.system, self.request, self.dimensions)
+
+    def own_dims(self, name: str) -> int:
+        """Number of dimensions that the result ``name`` has at one point."""
+        return self.path + (0 if name == OUTCOME.name else len(self.analysis.variable(name).dims))
+
+
+def analyse(name: str, system: System, outputs: Sequence[str] | None, options: Mapping[str, Any]) -> Result:
+    """The analysis ``name`` of one ``system``; see the module's docstring."""
+    job, parameters = _job(name, system, outputs, options)
+    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(parameters)):
+        found = _pure(job)(parameters)
+    else:
+        found = _concrete(job, parameters)
+    return Result({name: x[0] for name, x in found.items()} if job.single else found)
+
+
+def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapping[str, Any]) -> tuple[_Job, Any]:
+    """The checked call, and its numbers as arrays."""
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise InputError("jax_enable_x64 = False: allowed is True, by jax.config.update or within jax.enable_x64(True)")
+    if not isinstance(system, System):
+        raise InputError(
+            f"system: got a {type(system).__name__}; allowed is a system such as drivetrain_jax.Cardan(...)"
+        )
+    try:
+        # The model first: only a system with one declares what the analysis takes from its class.
+        model = get_analysis(name).model(type(system))
+        analysis = get_analysis(name).for_system(type(system))
+    except KeyError:
+        known = analyses_of(type(system))
+        guess = did_you_mean(name, known)
+        raise InputError(f"{name}: unknown to {system.name}{guess}; allowed is one of {', '.join(known)}") from None
+    values = {key: value for key, value in system.values.items() if key in model.parameters}
+    try:
+        request = make_request(type(system), analysis, [outputs] if isinstance(outputs, str) else outputs, options)
+        if model.check:
+            model.check(values)
+        dimensions = dimensions_of(analysis, type(system), request, values)
+    except ValueError as error:
+        # Without a scene the names of its tables mean nothing to the caller.
+        raise InputError(re.sub(r"^(fixed|options)\.", "", str(error))) from None
+    along = analysis.path_axis(type(system), request)
+    leaf = None if along is None else path_entry(values, along)
+    if along is not None and isinstance(leaf, jax.core.Tracer):
+        raise InputError(
+            f"{along}: a traced array; allowed for the path that the analysis follows are concrete numbers"
+        )
+    path = None if along is None else np.atleast_1d(np.asarray(leaf, float))
+    parameters = jax.tree.map(lambda x: None if isinstance(x, str) or x is leaf else jnp.asarray(x, float), values)
+    if batch := next((x.shape for x in jax.tree.leaves(parameters) if x.ndim), None):
+        allowed = "allowed is one system, or a batch under jax.vmap"
+        raise InputError(f"{name}: parameters of the shape {batch}; {allowed}")
+    rest = jax.tree.map(lambda x: x if isinstance(x, str) else path if x is leaf else None, values)
+    single = along is not None and np.ndim(leaf) == 0  # pyright: ignore[reportArgumentType]
+    return _Job(analysis, type(system), request, Constants(rest), along is not None, single, dimensions), parameters
+
+
+def _concrete(job: _Job, parameters: Any) -> dict[str, Array]:
+    """The results by the solver with the least predicted cost, compiled once for all numbers."""
+    columns = eqx.combine(jax.tree.map(lambda x: np.asarray(x)[None], parameters), job.constants.tree)
+    efforts = [float(np.max(np.asarray(solver.effort(columns), float))) for solver in job.solvers]
+    costs = [effort * solver.unit_cost for effort, solver in zip(efforts, job.solvers, strict=True)]
+    index = int(np.argmin(costs))
+    if not np.isfinite(costs[index]):
+        shapes = jax.eval_shape(_pure(job), parameters)
+        missing = {v.name: v.missing for v in job.analysis.variables} | {OUTCOME.name: Outcome.STEP_LIMIT}
+        return {name: jnp.full(x.shape, missing[name], x.dtype) for name, x in shapes.items()}
+    return _compiled(job, index)(parameters, np.int64(np.ceil(efforts[index])))
+
+
+@lru_cache(maxsize=64)
+def _compiled(job: _Job, index: int) -> Callable[..., dict[str, Array]]:
+    _programs.enable()
+    return _program(job, partial(_solve, job, index), f"solver {index}", 1)
+
+
+def _program(job: _Job, function: Callable[..., Any], name: str, lanes: int) -> Callable[..., Any]:
+    """``function`` of concrete values of ``lanes`` points, compiled once, and stored on disk for later processes."""
+    solver = job.solvers[0]
+    options = compiler_options(lanes, march=solver.march, short_loops=solver.short_loops)
+    # Without optimisation if a call takes milliseconds: a user with many calls compiles them by `jax.jit`.
+    if lanes <= _FEW and not solver.lengthy:
+        options = options_for_few()
+    request, constants = job.request, [x.tolist() if isinstance(x, np.ndarray) else x for x in job.constants.leaves]
+    content = [name, request.outputs, request.method, dict(request.options), constants, job.path, job.single]
+    return _programs.Program(function, options, _programs.program_identity(job.system, job.analysis, repr(content)))
+
+
+@lru_cache(maxsize=64)
+def _pure(job: _Job) -> Callable[[Any], dict[str, Array]]:
+    """The function of the parameters, with its derivatives."""
+    _programs.enable()
+
+    @jax.custom_jvp
+    def solve(parameters: Any) -> dict[str, Array]:
+        return _apart(job, "values")(parameters)
+
+    @solve.defjvp
+    def _(primals: tuple[Any], tangents: tuple[Any]) -> tuple[dict[str, Array], dict[str, Any]]:
+        (parameters,), (directions,) = primals, tangents
+        if job.analysis.once:
+            parameters = _once(job.analysis.once)(parameters)
+        outputs = tuple(dict.fromkeys((*job.request.outputs, *job.analysis.derivative_outputs(job.request.outputs))))
+        wider = job if outputs == job.request.outputs else replace(job, request=replace(job.request, outputs=outputs))
+        results = _pure(wider)(parameters)
+        jacobians = _apart(wider, "derivatives")((parameters, results)) if job.analysis.derivatives else {}
+        kept = {name: results[name] for name in (*job.request.outputs, OUTCOME.name)}
+        smooth = {name: x for name, x in kept.items() if jnp.issubdtype(x.dtype, jnp.inexact)}
+        none = {name: np.zeros(x.shape, jax.dtypes.float0) for name, x in kept.items()}
+        return kept, none | _tangents(smooth, dict(jacobians), jax.tree.leaves(directions))
+
+    return solve
+
+
+@cache
+def _once(message: str) -> Callable[[Any], Any]:
+    """The identity, whose derivative is an error."""
+
+    @jax.custom_jvp
+    def same(parameters: Any) -> Any:
+        return parameters
+
+    @same.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        raise InputError(message)
+
+    return same
+
+
+@lru_cache(maxsize=128)
+def _apart(job: _Job, kind: str, batches: tuple[tuple[int, tuple[bool, ...]], ...] = ()) -> Callable[[Any], Any]:
+    """The ``values``, or the ``derivatives`` of parameters and values, of a point in nested ``batches``.
+
+    For concrete numbers, such as those of an eager ``jax.vmap`` or ``jax.grad``, it is a program of its own; for traced ones
+    it is part of the caller's.
+    """
+
+    def function(given: Any) -> Any:
+        if kind == "values":
+            return _solve(job, 0, given)
+        parameters, results = given
+        return job.analysis.derivatives(job.system, job.request, parameters, job.constants, results)  # pyright: ignore[reportOptionalCall]
+
+    for batch, own in batches:
+        function = partial(_mapped, function, batch, own)
+    inlined, lanes = custom_vmap(jax.jit(function)), math.prod(batch for batch, _ in batches)
+
+    @inlined.def_vmap
+    def _(batch: int, batched: Any, given: Any) -> Any:
+        found = _apart(job, kind, (*batches, (batch, tuple(jax.tree.leaves(batched[0])))))(given)
+        return found, jax.tree.map(lambda _: True, found)
+
+    @cache
+    def program() -> Callable[..., Any]:
+        return _program(job, function, f"{kind} {batches}", lanes)
+
+    def call(given: Any) -> Any:
+        if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(given)):
+            return inlined(given)
+        return _concrete(job, given) if kind == "values" and not batches else program()(given)
+
+    return call
+
+
+def _mapped(function: Callable[[Any], Any], batch: int, own: tuple[bool, ...], given: Any) -> Any:
+    """``function`` of every member of a batch, in which the leaves ``own`` of ``given`` have a first axis."""
+    leaves, tree = jax.tree.flatten(given)
+    axes = [0 if each else None for each in own]
+    return jax.vmap(lambda *x: function(jax.tree.unflatten(tree, x)), axes, axis_size=batch)(*leaves)
+
+
+@jax.jit
+def _tangents(results: dict[str, Array], jacobians: dict[str, Array], directions: list[Array]) -> dict[str, Array]:
+    """The tangent of each result: 0 for error estimates, NaN for a result without a derivative."""
+    direction = jnp.stack(directions)
+
+    def tangent(name: str, result: Array) -> Array:
+        if name in jacobians:
+            jacobian = jnp.asarray(jacobians[name], result.dtype).reshape(result.size, direction.size)
+            return _product(jacobian, direction.astype(result.dtype)).reshape(result.shape)
+        unknown = 0.0 if name.endswith(("_error", "_residual")) else jnp.nan
+        return jnp.full(result.shape, unknown, result.dtype) * jnp.sum(direction)
+
+    return {name: tangent(name, x) for name, x in results.items()}
+
+
+def _product(jacobian: Array, direction: Array) -> Array:
+    """``jacobian @ direction``, in which 0 times NaN is 0, also when transposed.
+
+    A NaN thus affects only its own result and parameter. The product is written as the solution x of
+    ``x = (jacobian @ direction, direction)``, because jax accepts a given transpose of a linear solve.
+    """
+    count = len(jacobian)
+
+    def times(matrix: Array, vector: Array) -> Array:
+        return jnp.sum(jnp.where(vector == 0, 0.0, matrix * vector), axis=1)
+
+    solution = jax.lax.custom_linear_solve(
+        lambda x: x.at[:count].add(-jacobian @ x[count:]),
+        jnp.pad(direction, (count, 0)),
+        lambda _, b: b.at[:count].add(times(jacobian, b[count:])),
+        lambda _, b: b.at[count:].add(times(jacobian.T, b[:count])),
+    )
+    return solution[:count]
+
+
+def _solve(job: _Job, index: int, parameters: Any, effort: Array | None = None) -> dict[str, Array]:
+    """The results of one point by solver number ``index``; without ``effort`` the effort is predicted for every lane."""
+    solver = job.solvers[index]
+
+    def of_lanes(constants: Constants, parameters: Any, effort: Array) -> dict[str, Array]:
+        lanes = max((x.shape[-1] for x in jax.tree.leaves(parameters) if x.ndim), default=1)
+
+        def solve(values: Any, effort: Array, count: int) -> dict[str, Array]:
+            found = solver.solve(eqx.combine(values, constants.tree), effort)
+            return {name: _with_lanes(x, job.own_dims(name), count) for name, x in found.items()}
+
+        if predict is None:
+            return solve(parameters, effort, lanes)
+        needed = jnp.broadcast_to(predict(eqx.combine(parameters, constants.tree)), lanes)
+        order = jnp.argsort(needed)
+        in_order = jax.tree.map(lambda x: x[order] if x.ndim else x, (parameters, needed))
+
+        def block(part: Any, count: int) -> dict[str, Array]:
+            return solve(part[0], jnp.max(part[1]), count)
+
+        found = in_blocks(block, in_order, lanes, _TOGETHER)
+        place = jnp.argsort(order)
+        return {name: x[..., place] for name, x in found.items()}
+
+    predict = solver.steps if effort is None else None
+    if not jax.tree.leaves(parameters):
+        return {name: x[..., 0] for name, x in of_lanes(job.constants, parameters, jnp.int64(1)).items()}
+    return lanes_last(of_lanes, job.constants, parameters, jnp.int64(1) if effort is None else effort)
+
+
+def _with_lanes(result: Array, own: int, lanes: int) -> Array:
+    """``result`` with the lanes as last axis, also if it does not depend on the varying parameters."""
+    result = jnp.asarray(result)
+    result = result if result.ndim > own else result[..., None]
+    return jnp.broadcast_to(result, (*result.shape[:-1], lanes))
 
 
 @dataclass(frozen=True)

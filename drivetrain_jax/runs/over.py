@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax import analyses, functions
+from drivetrain_jax import analyses
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax._units import with_unit
@@ -270,7 +270,7 @@ def _variable(name: str, shape: jax.ShapeDtypeStruct, described: Variable | None
 
 def _named(result: Any, name: str) -> dict[str, Array]:
     """The arrays of a result by name."""
-    if isinstance(result, functions.Result):
+    if isinstance(result, analyses.Result):
         result = result.variables
     named, found = result if isinstance(result, Mapping) else {name: result}, {}
     for key, value in named.items():

@@ -12,9 +12,9 @@ from scipy.integrate import solve_ivp
 
 import drivetrain_jax as dt
 from drivetrain_jax._errors import InputError
+from drivetrain_jax.analyses import analyse
 from drivetrain_jax.analysis import Outcome, Request
 from drivetrain_jax.analysis.history import analysis as history
-from drivetrain_jax.functions import analyse
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import Component, Flow, System, serves
 from tests.oracles import tripod_reference as oracle

@@ -12,8 +12,8 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax._quantities import Variable
+from drivetrain_jax.analyses import analyse
 from drivetrain_jax.analysis import get_analysis
-from drivetrain_jax.functions import analyse
 from drivetrain_jax.invariants import check
 from drivetrain_jax.systems import System, get_system, parameter, serves
 

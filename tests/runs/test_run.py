@@ -20,8 +20,8 @@ import xarray as xr
 from interrupts import stop_after
 
 import drivetrain_jax as dt
+from drivetrain_jax.analyses import analyse
 from drivetrain_jax.analysis import Dimension, Solver
-from drivetrain_jax.functions import analyse
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.output import status
 from drivetrain_jax.runs.run import Incomplete, run_to_file
@@ -439,7 +439,7 @@ def test_wrong_results_of_an_analysis_are_one_line(monkeypatch, found, dim, mess
     solvers, labels = (Solver("fixed", lambda *_: found),), (Dimension(dim, "part of the wave", (1, 2, 3)),)
     wrong = replace(toy.ANALYSES["toy"], solvers=lambda *_: solvers, dimensions=lambda *_: labels)
     monkeypatch.setitem(toy.ANALYSES, "toy", wrong)
-    monkeypatch.setattr("drivetrain_jax.functions.get_analysis", lambda _: wrong)
+    monkeypatch.setattr("drivetrain_jax.analyses.get_analysis", lambda _: wrong)
     with pytest.raises((Incomplete, dt.InputError)) as raised:
         if into == "scene":
             dt.run({"system": "toy", "analysis": "toy", "outputs": ["wave"], "fixed": {"a": 1.0}})
