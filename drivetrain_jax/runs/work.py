@@ -9,12 +9,12 @@ import uuid
 from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -41,6 +41,8 @@ _TALKATIVE = ("distributed", "tornado", "asyncio")
 
 # Blocks and their results in the order of completion.
 Finished = Generator[tuple[Block, Results | None], None, None]
+# A block in work, its chunks, the results of those that are computed, and the position of the chunk to compute.
+Task = tuple[Block, tuple[Chunk, ...], dict[int, Results], int]
 
 
 @dataclass
@@ -101,39 +103,31 @@ class Threads:
         started.
         """
 
-        def tasks() -> Iterator[tuple[_Open, int]]:
+        def tasks() -> Iterator[Task]:
             for block in blocks:
-                opened = _Open(block, job.plan(block), {})
-                job.prepare(opened.chunks)
+                chunks = job.plan(block)
+                job.prepare(chunks)
+                results: dict[int, Results] = {}
                 # A block without chunks still has a task, because its results must be written.
-                yield from ((opened, position) for position in range(max(len(opened.chunks), 1)))
+                yield from ((block, chunks, results, position) for position in range(max(len(chunks), 1)))
 
-        def compute(task: tuple[_Open, int]) -> Results:
-            opened, position = task
-            return job.compute(opened.chunks[position]) if opened.chunks else {}
+        def compute(task: Task) -> Results:
+            _, chunks, _, position = task
+            return job.compute(chunks[position]) if chunks else {}
 
         with closing(run_threads(tasks(), compute, self._count or usable_cores())) as computed:
-            for (opened, position), found in computed:
-                opened.results[position] = found
-                count = len(opened.chunks)
-                if count:
-                    tick(opened.chunks[position].points.size)
-                if len(opened.results) >= count:
-                    results = job.joined(opened.block, opened.chunks, [opened.results[k] for k in range(count)])
+            for (block, chunks, results, position), found in computed:
+                results[position] = found
+                if chunks:
+                    tick(chunks[position].points.size)
+                if len(results) >= len(chunks):
+                    joined = job.joined(block, chunks, [results[k] for k in range(len(chunks))])
                     if store is not None:
-                        store.write(first + opened.block.number, results)
-                    yield opened.block, results
+                        store.write(first + block.number, joined)
+                    yield block, joined
 
     def close(self) -> None:
         """End the workers."""
-
-
-class _Open(NamedTuple):
-    """A block in work, its chunks, and the results of those that are computed."""
-
-    block: Block
-    chunks: tuple[Chunk, ...]
-    results: dict[int, Results]
 
 
 def run_threads(
@@ -170,32 +164,24 @@ class Mismatch(ChunkError):
     """Raised if code, versions or instruction set of a worker differ from those of the run."""
 
 
-@dataclass(frozen=True)
-class Parcel:
-    """A job on its way to workers, its store, and the digest that its driver expects."""
-
-    digest: str
-    place: str
-    job: Job = field(compare=False, repr=False)
-    store: BlockStore | None = field(compare=False, repr=False)
-
-
 @lru_cache(maxsize=1)
-def _unpacked(parcel: Parcel) -> Parcel:
-    # The first copy with this digest serves all blocks; it holds the compiled kernels.
-    if parcel.job.digest != parcel.digest:
+def _first(job: Job) -> Job:
+    """The first of equal jobs that this worker has received; it holds the compiled kernels."""
+    return job
+
+
+def compute(job: Job, store: BlockStore | None, digest: str, block: Block, number: int) -> Results:
+    """Compute ``block`` in a worker. The results return to the driver without a store, otherwise the outcomes alone.
+
+    ``digest`` is that of the job in the driver.
+    """
+    if job.digest != digest:
         raise Mismatch("code, versions or instruction set differ from those of the run")
-    return parcel
-
-
-def compute(parcel: Parcel, block: Block, number: int) -> Results:
-    """Compute ``block`` in a worker. The results return to the driver without a store, otherwise the outcomes alone."""
-    parcel = _unpacked(parcel)
-    results = parcel.job.compute_block(block)
-    if parcel.store is None:
+    results = _first(job).compute_block(block)
+    if store is None:
         return results
     try:
-        parcel.store.write(number, results)
+        store.write(number, results)
     except OSError as error:
         raise RetryableError(str(error)) from None
     return {OUTCOME.name: results[OUTCOME.name]}
@@ -227,7 +213,6 @@ class Cluster(Threads):
         distributed = _distributed()
         if self._client is None:
             self._client = _connect(distributed, self._address, self._connection)
-        parcel = Parcel(job.digest, "" if store is None else store.place, job, store)
         remaining, running = iter(blocks), dict[str, Block]()
         workers = max(sum(self._client.nthreads().values()), 1)
         finished = distributed.as_completed(loop=self._client.loop)
@@ -236,7 +221,8 @@ class Cluster(Threads):
         while True:
             for block in islice(remaining, IN_FLIGHT * workers - len(running)):
                 number = first + block.number
-                future = self._client.submit(compute, parcel, block, number, key=f"block-{number}-{run}")
+                sent = (job, store, job.digest, block, number)
+                future = self._client.submit(compute, *sent, key=f"block-{number}-{run}")
                 running[future.key] = block
                 finished.add(future)
             if not running:

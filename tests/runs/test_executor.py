@@ -171,21 +171,21 @@ def test_wrong_executor_is_one_clear_line(monkeypatch, options, message):
 
 def test_a_worker_of_another_kind_is_refused_before_it_computes(grid_scene, monkeypatch):
     job = resolve(load_scene(grid_scene))
-    sent = pickle.dumps(work.Parcel(job.digest, "", job, None))
+    sent, expected = pickle.dumps(job), job.digest
     monkeypatch.setattr("drivetrain_jax._programs.versions", lambda _: {"jax": "9"})
-    parcel = pickle.loads(sent)
+    copy = pickle.loads(sent)
     monkeypatch.setattr(type(job), "compute", lambda *_: pytest.fail("it computes"))
     with pytest.raises(work.Mismatch, match=r"^code, versions or instruction set differ from those of the run$"):
-        work.compute(parcel, Block(0), 0)
+        work.compute(copy, None, expected, Block(0), 0)
 
 
 @pytest.mark.usefixtures("small_blocks")
 def test_a_worker_stores_its_block_and_returns_outcomes(grid_scene, tmp_path):
     job = resolve(load_scene(grid_scene))
     store = BlockFiles(tmp_path)
-    parcel = pickle.loads(pickle.dumps(work.Parcel(job.digest, store.place, job, store)))
+    copy, stored = pickle.loads(pickle.dumps((job, store)))
     block = Block(1, np.array([25, 27]))
-    assert list(work.compute(parcel, block, 7)) == ["outcome"]
+    assert list(work.compute(copy, stored, job.digest, block, 7)) == ["outcome"]
     for name, values in job.compute_block(block).items():
         assert values.tobytes() == store.read(7)[name].tobytes()
 
