@@ -63,8 +63,13 @@ class Job:
     @cached_property
     def solvers(self) -> tuple[Solver, ...]:
         """The solvers that a plan chooses from."""
-        # Before the first kernel, which the plan may need.
-        _check_double_precision()
+        # Before the first kernel, which the plan may need. The caller may have turned off double precision, or have the choice.
+        config: Any = jax.config
+        if not config.jax_enable_x64:
+            use_double_precision()
+            if not config.jax_enable_x64:
+                found = "jax_enable_x64 = False: set by the context of this call"
+                raise InputError(f"{found}; allowed is jax.enable_x64(True)")
         _programs.enable(short=True)
         return tuple(map(for_device, self.problem.solvers))
 
@@ -201,14 +206,6 @@ def _restored(problem: Problem, route: Route, full_size: bool, boxes: Shards) ->
     job = Job(problem, route, full_size=full_size)
     job.boxes = boxes
     return job
-
-
-def _check_double_precision() -> None:
-    """Turn on double precision in jax again, unless the caller has the choice."""
-    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        use_double_precision()
-    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        raise InputError("jax_enable_x64 = False: set by the context of this call; allowed is jax.enable_x64(True)")
 
 
 # A block: predicted work of one core in s, upper limits of its points and of the bytes of its results, and least number of

@@ -22,6 +22,8 @@ from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.scene import Problem, result_variables
 from drivetrain_jax.systems import System
 
+# LAPACK calls of XLA wait for their own thread pool, so two kernels with such calls can block each other forever (seen with jax
+# 0.10.2 on two cores).
 _LAPACK = threading.Lock()
 # Up to this number of points and this predicted cost (in units of the plan), computing takes less time than optimising the
 # kernels.
@@ -106,7 +108,7 @@ def compile_kernel(
     batch, kinds = _batch(solver, grid, chunk, variables)
     options = compiler_options(chunk, march=solver.march, short_loops=solver.short_loops)
     function = compiled(batch, kinds, options_for_few() if few else options, identity)
-    return Kernel(function, chunk, tuple(variables), _turn(function))
+    return Kernel(function, chunk, tuple(variables), _LAPACK if calls(function, "lapack_") else nullcontext())
 
 
 def for_device(solver: Solver) -> Solver:
@@ -156,12 +158,3 @@ def _compiled(key: _Key, size: int, few: bool) -> Kernel:
     content = [key.structure, [[v.name, v.dims, v.dtype] for v in key.variables], size]
     identity = program_identity(key.system, key.analysis, repr(content)) if key.is_named else ""
     return compile_kernel(key.solver, key.grid, size, key.variables, few, identity)
-
-
-def _turn(kernel: jax.stages.Compiled) -> AbstractContextManager[object]:
-    """The lock that a call needs.
-
-    LAPACK calls of XLA wait for their own thread pool, so two such kernels can block each other forever (seen with jax
-    0.10.2 on two cores).
-    """
-    return _LAPACK if calls(kernel, "lapack_") else nullcontext()

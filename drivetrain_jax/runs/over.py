@@ -102,15 +102,12 @@ def _scene_table(
     # An empty list stands for a default of none.
     conversions = system.physical.conversions if system.physical else ()
     varied = {*over, *(each.parameter for each in conversions if each.needs[0] in over)}
-    kept = {key: value for key, value in system.values.items() if key not in varied and not _is_empty(value)}
+    varied |= {key for key, value in system.values.items() if isinstance(value, tuple) and not value}
+    kept = {key: value for key, value in system.values.items() if key not in varied}
     fixed = {key: _plain(key, value, system.parameter(key).listed) for key, value in kept.items()}
     axes = {key: value if isinstance(value, Mapping) else {"values": _row(key, value)} for key, value in over.items()}
     table = {"system": system.name, "analysis": name, "axes": axes, "fixed": fixed, "options": dict(options)}
     return table if outputs is None else table | {"outputs": [outputs] if isinstance(outputs, str) else list(outputs)}
-
-
-def _is_empty(value: Any) -> bool:
-    return isinstance(value, tuple) and not value
 
 
 def _plain(name: str, value: Any, listed: bool) -> Any:

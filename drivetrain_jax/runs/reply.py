@@ -237,7 +237,8 @@ def _of_data(
         follow = {each.parameter: each.needs for each in shaft.physical.conversions}
         own = {name: shaft.quantity(name, value) for name, value in point.items()}
         ends = {known[0]: known[1] for name, known in own.items() if known and name != without}
-        given = {name: x for name, x in shaft.data.items() if name in shaft.physical.names and _is_number(x)}
+        numbers = {name: x for name, x in shaft.data.items() if isinstance(x, (int, float)) and not isinstance(x, bool)}
+        given = {name: x for name, x in numbers.items() if name in shaft.physical.names}
         given = {**given, **ends}
         given.pop(follow[without][0] if without in follow else "", None)
         known = {name for name, needs in follow.items() if set(needs) <= given.keys()}
@@ -259,10 +260,6 @@ def _of_data(
         slope = (at({**data, name: value + step}) - at({**data, name: value - step})) / (2 * step)
         found.append(Sensitivity(name, names[name].units, slope, slope * value / 100))
     return sorted(found, key=lambda each: -abs(each.percent))
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def gradient_lines(found: list[Sensitivity] | None) -> list[str]:
