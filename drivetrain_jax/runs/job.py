@@ -63,7 +63,7 @@ class Job:
     @cached_property
     def solvers(self) -> tuple[Solver, ...]:
         """The solvers that a plan chooses from."""
-        # Before the first kernel, which the plan may need. The caller may have turned off double precision, or have the choice.
+        # Before the first kernel, which the plan may need. The caller may have turned it off, or may have the choice.
         config: Any = jax.config
         if not config.jax_enable_x64:
             use_double_precision()

@@ -22,8 +22,8 @@ from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.scene import Problem, result_variables
 from drivetrain_jax.systems import System
 
-# LAPACK calls of XLA wait for their own thread pool, so two kernels with such calls can block each other forever (seen with jax
-# 0.10.2 on two cores).
+# LAPACK calls of XLA wait for their own thread pool, so two kernels with such calls can block each other forever (seen with
+# jax 0.10.2 on two cores).
 _LAPACK = threading.Lock()
 # Up to this number of points and this predicted cost (in units of the plan), computing takes less time than optimising the
 # kernels.

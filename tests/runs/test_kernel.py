@@ -14,9 +14,10 @@ import drivetrain_jax as dt
 from drivetrain_jax.analysis.numerics import kernels
 from drivetrain_jax.atlas import charts
 from drivetrain_jax.runs import kernel
+from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.job import Block, Job
 from drivetrain_jax.runs.resolve import resolve
-from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.runs.scene import load_scene, result_variables
 from drivetrain_jax.runs.work import DIRECT
 
 
@@ -121,11 +122,16 @@ def test_an_accelerator_gets_wide_batches_and_gives_the_same_results(monkeypatch
 
 def test_kernels_with_lapack_calls_take_turns():
     """Two such kernels at a time can block each other forever."""
-    matrix = jax.ShapeDtypeStruct((8, 4, 4), float)
-    with_lapack = jax.jit(jnp.linalg.eigvals).lower(matrix).compile()
-    without = jax.jit(jnp.sin).lower(matrix).compile()
-    assert kernel._turn(with_lapack) is kernel._turn(with_lapack) is kernel._LAPACK
-    assert kernel._turn(without) is not kernel._LAPACK
+    scene = load_scene({"system": "toy", "analysis": "toy", "axes": {"a": {"values": [1.0, 2.0]}}})
+    for function, waits in ((jnp.linalg.eigvals, True), (jnp.sin, False)):
+
+        def solve(values, effort, function=function):
+            matrix = jnp.full((4, 4), values["a"][0])
+            return {"value": jnp.sum(jnp.real(function(matrix))), "outcome": jnp.int8(0)}
+
+        solver = replace(scene.solvers[0], solve=solve)
+        compiled = kernel.compile_kernel(solver, Grid.of(scene), 2, result_variables(scene))
+        assert (compiled.turn is kernel._LAPACK) is waits
 
 
 def test_scenes_of_few_points_are_compiled_without_optimising(monkeypatch):
