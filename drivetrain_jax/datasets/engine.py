@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import xarray as xr
 from xarray.backends import BackendArray, BackendEntrypoint
-from xarray.core import indexing, nputils
+from xarray.core import indexing
 
 from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError
@@ -285,8 +285,14 @@ class _Result(BackendArray):
         return indexing.explicit_indexing_adapter(key, self.shape, support.OUTER, self._block)
 
     def _points(self, key: Key) -> np.ndarray:
-        indices = np.ogrid[tuple(slice(size) for size in self.shape)]
-        every = [nputils.NumpyVIndexAdapter(np.broadcast_to(index, self.shape))[key] for index in indices]
+        # Dimensions of arrays come first, those of slices follow.
+        behind = sum(isinstance(part, slice) for part in key)
+        spread, every = behind, []
+        for part, size in zip(key, self.shape, strict=True):
+            spread -= isinstance(part, slice)
+            chosen = np.arange(size)[part]
+            every.append(chosen.reshape(*chosen.shape, *(1,) * (spread if isinstance(part, slice) else behind)))
+        every = np.broadcast_arrays(*every)
         swept, own = every[: len(self.cells.axes)], every[len(self.cells.axes) :]
         if not own:
             return self.cells.points(swept, self.name)
