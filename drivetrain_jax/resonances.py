@@ -145,6 +145,51 @@ RATTLE = Resonances(
 )
 
 
+# Predicted parametric resonances of a driveline; the joints modulate its matrices twice a turn of the driven end.
+
+# Lowest modes with predictions.
+_MODES = 4
+
+
+def torsional_frequencies(values: Values) -> np.ndarray:
+    """Undamped natural frequencies [rad/s] of the `_MODES` lowest modes with straight joints; NaN if there are fewer."""
+    k, inertia = np.asarray(values["k"], float), np.asarray(values["J"], float)
+    ratio = np.asarray(values.get("ratio") or np.ones(len(k)), float)
+    twists = np.eye(len(k)) - np.diag(ratio[1:], -1)
+    factor = np.sqrt(k)[:, None] * twists / np.sqrt(inertia)
+    found = np.linalg.svd(factor, compute_uv=False)[::-1][:_MODES]
+    return np.pad(found, (0, _MODES - len(found)), constant_values=np.nan)
+
+
+def driveline_resonances(orders: int = 2) -> Resonances:
+    """H: omega_i/(2k), S: omega_i/(2k-1), C+: (omega_i + omega_j)/(2k), for i < j; labels end in the order k."""
+    ks, modes = range(1, orders + 1), range(_MODES)
+    pairs = [(i, j) for i in modes for j in modes if i < j]
+
+    def speeds(values: Values) -> np.ndarray:
+        w = torsional_frequencies(values)
+        return np.array(
+            [w[i] / (2 * k) for i in modes for k in ks]
+            + [w[i] / (2 * k - 1) for i in modes for k in ks]
+            + [(w[i] + w[j]) / (2 * k) for i, j in pairs for k in ks]
+        )
+
+    single = [f"{kind}{i + 1}{k}" for kind in "HS" for i in modes for k in ks]
+    return Resonances(
+        axis="speed",
+        parameters=("k", "J"),
+        labels=(*single, *(f"C+{i + 1}{j + 1}{k}" for i, j in pairs for k in ks)),
+        values=speeds,
+        long_name="predicted parametric resonance",
+        multipliers=("+1",) * _MODES * orders + ("-1",) * _MODES * orders + ("pair",) * len(pairs) * orders,
+        up_to=driveline_resonances,
+        families=_CARDAN_FAMILIES[:3],
+    )
+
+
+DRIVELINE = driveline_resonances()
+
+
 # Predictions of the systems of this package, so that their figures need no jax.
 BUILT_IN: dict[str, Resonances | None] = {
     "cardan": CARDAN,
@@ -152,7 +197,7 @@ BUILT_IN: dict[str, Resonances | None] = {
     "tripod": None,
     "planetary": None,
     "bicardan": None,
-    "driveline": None,
+    "driveline": DRIVELINE,
 }
 
 
@@ -207,6 +252,14 @@ def orders_of(system: str, values: Mapping[str, Any]) -> Orders | None:
     if system == "bicardan":
         # A joint under an angle and a torque bends the shaft twice a turn.
         return Orders("shaft", {"order 1": 1.0, "order 2 (joints)": 2.0})
+    if system == "driveline":
+        # A joint is excited twice a turn of its input, and less by multiples of it.
+        count, ratio = len(values.get("k", ())), values.get("ratio") or ()
+        beta = values.get("beta") or (1.0,) * count
+        speeds = np.cumprod([1.0, *np.abs(ratio or np.ones(count))])
+        turns = sorted({round(float(speed), 12) for speed, angle in zip(speeds, beta, strict=False) if angle != 0})
+        names = {f"order {n * s:.4g} (joints)": n * s for s in turns for n in (2, 4)}
+        return Orders("driven end", names) if names else None
     mesh, angles = values.get("carrier_order"), values.get("planet_angle")
     if system == "planetary" and isinstance(mesh, (int, float)) and angles:
         meshes = {f"mesh order {k}": float(k * mesh) for k in (1, 2, 3)}

@@ -174,6 +174,8 @@ def _numbers(parameter: Parameter, value: Any, physical: bool) -> Any:
     return value if hasattr(value, "ndim") else numbers
 
 
+# The column of a table with names for the reader alone.
+_NAMES = "part"
 _HEADER = re.compile(r"\s*(.+?)\s*(?:[\[(]\s*(.*?)\s*[\])])?\s*")
 
 
@@ -181,7 +183,8 @@ def read_table(path: Path) -> dict[str, Any]:
     """The parameters in the CSV or XLSX file ``path``: a value or a list by name, ``"60 mm"`` in the unit of the header.
 
     The first row holds ``name [unit]`` or ``name (unit)``; empty cells below a column are left out, and so are columns
-    without a name. Raises :class:`InputError` for a file that is no such table.
+    without a name and the column ``part``, which names the rows. Raises :class:`InputError` for a file that is no such
+    table.
     """
     rows = _rows(path).dropna(how="all")
     if len(rows) < 2:
@@ -190,6 +193,8 @@ def read_table(path: Path) -> dict[str, Any]:
     for header, *cells in (rows[number].tolist() for number in rows):
         if isinstance(header, str):
             name, unit = _HEADER.fullmatch(header).groups()  # pyright: ignore[reportOptionalMemberAccess]
+            if name == _NAMES:
+                continue
             if name in found:
                 raise InputError(f"data = {str(path)!r}: has two columns {name}; allowed is one")
             count = max((i + 1 for i, cell in enumerate(cells) if isinstance(cell, str)), default=0)

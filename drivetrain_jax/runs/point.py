@@ -283,7 +283,9 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
     parameters = {p.parameter.name: p.values[0].item() for a in scene.axes for p in a.together} | dict(scene.fixed)
     ordered = {p.name: parameters[p.name] for p in scene.system.parameters if p.name in parameters}
     physical = _physical(job)
-    says = scene.analysis.model(scene.system).says
+    model = scene.analysis.model(scene.system)
+    # The sentence needs all results.
+    says = model.says if outcome.has_value and all(v.name in values for v in model.results) else None
     return PointResult(
         system=scene.system.name,
         analysis=scene.analysis.name,
@@ -299,7 +301,7 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
         advice=scene.analysis.advice(scene.request),
         growth=growth_of(scene.system, ordered, values, speed_in_rpm(scene.system, physical)),
         orders=order_crossings(scene, ordered, values),
-        sentence=says(values, ordered) if says and outcome.has_value else "",
+        sentence=says(values, ordered) if says else "",
     )
 
 

@@ -33,7 +33,8 @@ MATERIALS = {
 }
 
 
-def _ring(outer: Any, inner: Any, power: int) -> Any:
+def ring_power(outer: Any, inner: Any, power: int) -> Any:
+    """``outer^power - inner^power``; :class:`InputError` unless the bore is smaller."""
     xp, outside, inside = numeric(outer, inner)
     # A traced value cannot be checked.
     if xp is np and np.any(inside >= outside):
@@ -42,11 +43,11 @@ def _ring(outer: Any, inner: Any, power: int) -> Any:
 
 
 def _area(outer: Any, inner: Any) -> Any:
-    return math.pi / 4 * _ring(outer, inner, 2)
+    return math.pi / 4 * ring_power(outer, inner, 2)
 
 
 def _second_moment(outer: Any, inner: Any) -> Any:
-    return math.pi / 64 * _ring(outer, inner, 4)
+    return math.pi / 64 * ring_power(outer, inner, 4)
 
 
 def shear_coefficient(outer: Any, inner: Any, e: Any, g: Any) -> Any:

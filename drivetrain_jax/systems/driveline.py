@@ -22,9 +22,21 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
-from drivetrain_jax._quantities import Component, Dimension, Variable
+from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
 from drivetrain_jax._wording import counted
-from drivetrain_jax.systems._base import POSITIVE, RPM, Number, System, Values, numeric, parameter, serves
+from drivetrain_jax.resonances import DRIVELINE
+from drivetrain_jax.systems._base import (
+    POSITIVE,
+    RPM,
+    Conversion,
+    Number,
+    PhysicalData,
+    System,
+    Values,
+    numeric,
+    parameter,
+    serves,
+)
 from drivetrain_jax.systems._models import (
     Block,
     FloquetModel,
@@ -35,6 +47,7 @@ from drivetrain_jax.systems._models import (
     SpringSystem,
     weighted_factor,
 )
+from drivetrain_jax.systems.bicardan import MATERIALS, ring_power
 from drivetrain_jax.systems.cardan import speed_ratio
 
 Components = Sequence[Any]
@@ -342,6 +355,26 @@ def panels_needed(line: Driveline, rtol: float) -> Any:
 
 
 _CHAIN = ("speed", *_LISTS)
+_EACH: dict[str, Any] = {"listed": True, "broadcast": True}
+PHYSICAL = PhysicalData(
+    (
+        Parameter("outer_diameter", "m", "outer diameters of the shafts", usual=10.0, **POSITIVE, **_EACH),
+        Parameter("inner_diameter", "m", "bores of the shafts", default=0.0, usual=10.0, lower=0.0, **_EACH),
+        Parameter("length", "m", "lengths of the shafts", usual=100.0, listed=True, **POSITIVE),
+        Parameter("material", "1", "material of all shafts: G", choices=tuple(MATERIALS)),
+        Parameter("G", "Pa", "shear modulus of the shafts", **POSITIVE, **_EACH),
+    ),
+    (
+        Conversion("G", ("material",), lambda name: MATERIALS[name][1], "that of the material", optional=True),
+        Conversion(
+            "k",
+            ("outer_diameter", "inner_diameter", "length", "G"),
+            lambda outer, inner, length, g: math.pi / 32 * g * ring_power(outer, inner, 4) / length,
+            "pi/32 G (outer_diameter^4 - inner_diameter^4)/length",
+        ),
+    ),
+)
+
 SHAFT = Dimension("shaft", "number of the shaft from the driven end", ())
 _LIST = {"listed": True, "lower": 0.0}
 _NONE: dict[str, Any] = {"default": (), "listed": True}
@@ -360,6 +393,8 @@ class Driveline(System):
     name = "driveline"
     title = "Driveline: a chain of Hooke joints, gears, shafts and inertias"
     source = "own derivation, docs/theory/driveline.md"
+    physical = PHYSICAL
+    resonances = DRIVELINE
     periods_per_turn = 0
     roles = MappingProxyType({"speed": "speed"})
     mode_families = ("torsional",)

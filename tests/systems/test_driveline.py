@@ -16,6 +16,8 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
 
 import drivetrain_jax as dt
+from drivetrain_jax.resonances import driveline_resonances, orders_of
+from drivetrain_jax.runs.physical import read_table
 from drivetrain_jax.systems.driveline import MOST_TURNS, best_phases, uneven_rotation
 from tests.oracles import driveline_reference as oracle
 from tests.quick_jit import quick_jit
@@ -191,11 +193,13 @@ def test_lists_that_do_not_match_are_refused_in_one_line(changes, message):
 
 @pytest.mark.parametrize("gears", [False, True])
 def test_half_a_period_is_enough_for_phases_of_a_quarter_turn(gears):
-    chain = random_chain(np.random.default_rng(7), 3, 2, gears) | {"phase": [0.0, math.pi / 2, 0.0]}
+    chain = random_chain(np.random.default_rng(7), 3, 2, gears)
+    chain["phase"] = [0.0, math.pi / 2, 0.0]
     model = dt.Driveline(**chain).floquet_model()
     assert model.reduced.span == model.natural.span / 2
     assert farthest(multipliers_by_scipy(model.reduced), multipliers_by_scipy(model.natural)) < 1e-11
-    whole = dt.Driveline(**chain | {"phase": [0.0, 1.5, 0.0]}).floquet_model()
+    chain["phase"] = [0.0, 1.5, 0.0]
+    whole = dt.Driveline(**chain).floquet_model()
     assert whole.reduced.span == whole.natural.span
 
 
@@ -387,3 +391,53 @@ def test_phases_across_a_gear_make_up_for_nothing():
     assert found.speed_variation == pytest.approx(found.least_variation, rel=1e-12)
     # The first joint's speed, doubled, passes a joint of the double speed.
     assert alone.speed_variation < found.speed_variation < 2 * alone.speed_variation * 1.01
+
+
+TRUCK = """part,outer_diameter [mm],inner_diameter [mm],length [mm],J [kg cm2],c [N m s/rad],beta [deg],phase [deg],ratio
+front tube,63.5,60,700,300,0.5,8,0,1
+rear tube,63.5,60,1300,300,0.5,20,0,1
+pinion,32,0,150,500,1,20,90,1
+half shafts,30,0,600,80000,20,0,0,11/41
+"""
+
+
+def test_a_table_of_parts_is_a_driveline(tmp_path):
+    """One row a part in an engineer's units; the column of names is for the reader."""
+    path = tmp_path / "truck.csv"
+    path.write_text(TRUCK)
+    data = read_table(path)
+    assert "part" not in data
+    found = dt.point("driveline", "modes", material="steel", **data)
+    g = 2.1e11 / 2.6
+    tube = g * math.pi / 32 * (0.0635**4 - 0.060**4) / 1.3
+    assert found.parameters["k"][1] == pytest.approx(tube, rel=1e-12)
+    assert found.parameters["J"] == pytest.approx((0.03, 0.03, 0.05, 8.0), rel=1e-12)
+    assert found.parameters["ratio"][3] == 11 / 41
+    # Joints turn at the speed of the driven end: their orders are 2 and 4.
+    first = found.natural_frequency[1]
+    assert set(found.crossings) == {"order 2 (joints)", "order 4 (joints)"}
+    assert found.crossings["order 2 (joints)"][1] == pytest.approx(30 * first, rel=1e-12)
+
+
+def test_predicted_resonances_are_sums_of_the_frequencies_of_modes():
+    case = CASES["ref6"]
+    found = driveline_resonances(2)
+    speeds = dict(zip(found.labels, found.values({n: tuple(case[n]) for n in ("k", "J", "ratio")}), strict=True))
+    omega = 2 * math.pi * np.asarray(dt.modes(of_case("ref6"), outputs=["natural_frequency"]).natural_frequency)
+    assert speeds["H12"] == pytest.approx(omega[0] / 4)
+    assert speeds["S41"] == pytest.approx(omega[3])
+    assert speeds["C+132"] == pytest.approx((omega[0] + omega[2]) / 4)
+    few = found.values({"k": (4.0,), "J": (1.0,)})
+    assert few[found.labels.index("S11")] == pytest.approx(2.0)
+    assert np.isnan(few[found.labels.index("S21")])
+
+
+def test_orders_follow_from_the_speed_of_each_joint():
+    found = orders_of("driveline", {"k": (1.0,) * 3, "beta": (0.1, 0.0, 0.2), "ratio": (1.5, -2.0, 1.0)})
+    assert found is not None and found.per_turn == {
+        "order 2 (joints)": 2.0,
+        "order 4 (joints)": 4.0,
+        "order 6 (joints)": 6.0,
+        "order 12 (joints)": 12.0,
+    }
+    assert orders_of("driveline", {"k": (1.0,), "beta": (0.0,)}) is None
