@@ -360,19 +360,24 @@ class Work:
 
         missing = (block for block in job.blocks(points) if block.number not in done)
         try:
-            # Closed on exit: after an interrupt nothing further starts.
-            with closing(self.executor.run(job, missing, self.store, first, tick)) as finished:
-                for block, results in finished:
-                    results = self._received(job, block, results, first, receiver)
-                    done.add(block.number)
-                    outcome = results[OUTCOME.name]
-                    progress.count(outcome)
-                    progress.computed += outcome.size
-                    computed += outcome.size
-                    progress.cost = max(progress.cost, computed)
-                    self.report(progress)
-            if computed < progress.total_cost:
-                raise RetryableError("some blocks returned no result")
+            try:
+                # Closed on exit: after an interrupt nothing further starts.
+                with closing(self.executor.run(job, missing, self.store, first, tick)) as finished:
+                    for block, results in finished:
+                        results = self._received(job, block, results, first, receiver)
+                        done.add(block.number)
+                        outcome = results[OUTCOME.name]
+                        progress.count(outcome)
+                        progress.computed += outcome.size
+                        computed += outcome.size
+                        progress.cost = max(progress.cost, computed)
+                        self.report(progress)
+                if computed < progress.total_cost:
+                    raise RetryableError("some blocks returned no result")
+            except Exception:
+                # In a library's code an interrupt may end as an exception of that library: the report raises it again.
+                self.report(progress)
+                raise
         except KeyboardInterrupt:
             # It may come between storing a block and counting it.
             for _, results in self._stored(job, first, points, done):

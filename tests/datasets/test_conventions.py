@@ -37,7 +37,7 @@ FIRST = set({kind(path): path for path in reversed(SCENES)}.values())
 # The least that these options allow.
 OPTIONS = {"strobes": 128, "discard": 0, "num": 12, "samples": 5}
 # Lengths that depend on the system: both the tripod's and those of a chart without its multipliers.
-SIZES = {"multiplier": 2, "exponent": 2, "component": 3, "state": 2}
+SIZES = {"multiplier": 2, "exponent": 2, "component": 3, "state": 2, "shaft": 2, "joint": 2}
 PROVENANCE = {"created", "history", "wall_time_s", "checksums"}
 
 

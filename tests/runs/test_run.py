@@ -615,11 +615,29 @@ def test_signal_stops_promptly_and_loses_nothing(slow_process, sent):
     wait_for_parts(out, 1, process)
     process.send_signal(sent)
     _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == 130, stderr
     lines = stderr.splitlines()
     found = status(SLOW, out)
     assert lines[-1] == f"points: total=400 computed={found.done} reused=0 failed=0" and len(lines) == 2
     assert 0 < found.done < 400 and "Traceback" not in stderr
+
+
+def test_a_signal_that_ends_as_an_exception_of_a_library_is_an_interrupt(tmp_path):
+    signalled = []
+
+    class Breaking(Threads):
+        def run(self, *args):
+            yield next(iter(super().run(*args)))
+            signalled.append(True)
+            raise ValueError("Can't close the file")
+
+    def report(progress):
+        if signalled:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as stop:
+        run_to_file(SLOW, tmp_path / "r.nc", executor=Breaking(1), report=report)
+    assert 0 < stop.value.progress.computed == status(SLOW, tmp_path / "r.nc").done < 400
 
 
 def test_second_run_on_the_same_file_is_refused(slow_process):

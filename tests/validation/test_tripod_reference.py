@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
+from tests.sizes import full_after
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "reference" / "tripod.json").read_text())
 NINE_DEGREES = math.radians(9)
@@ -40,7 +41,7 @@ def test_states(equation):
         assert float(ds.velocity[i, k]) == pytest.approx(case["V"], abs=1e-8 * max(abs(case["V"]), scale))
 
 
-@pytest.fixture(scope="module", params=["29", "30"])
+@pytest.fixture(scope="module", params=full_after(1, ["29", "30"]))
 def floquet(request):
     """The cases of one element with the computed result."""
     cases = {key: case for key, case in FLOQUET.items() if key.startswith(request.param)}
