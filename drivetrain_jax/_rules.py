@@ -89,7 +89,7 @@ def _differ(one: xr.DataArray, other: xr.DataArray) -> xr.DataArray:
 
 @dataclass(frozen=True)
 class Declared:
-    """What is known of an analysis without jax: the rules of its results, and how figures draw them."""
+    """A record of an analysis that needs no jax: the rules of its results, and how figures draw them."""
 
     #: Rules of the results.
     rules: tuple[Rule, ...] = ()

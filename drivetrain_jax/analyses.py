@@ -30,7 +30,7 @@ from drivetrain_jax.analysis import OUTCOME, Analysis, Dimension, Outcome, Reque
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
 from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lanes_last, path_entry
 from drivetrain_jax.analysis.request import checked_solvers, dimensions_of, make_request
-from drivetrain_jax.systems import System
+from drivetrain_jax.systems import Model, System
 from drivetrain_jax.systems._base import printed
 
 # Lanes of similar effort that are solved together, and lanes whose program is compiled without optimisation.
@@ -110,22 +110,25 @@ def analyse(name: str, system: System, outputs: Sequence[str] | None, options: M
     return Result({name: x[0] for name, x in found.items()} if job.single else found)
 
 
-def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapping[str, Any]) -> tuple[_Job, Any]:
-    """The checked call, and its numbers as arrays."""
-    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        raise InputError("jax_enable_x64 = False: allowed is True, by jax.config.update or within jax.enable_x64(True)")
+def model_and_analysis(name: str, system: Any) -> tuple[Model, Analysis]:
+    """The model of ``system`` for the analysis ``name``, and this analysis for its class; ``InputError`` without one."""
     if not isinstance(system, System):
-        raise InputError(
-            f"system: got a {type(system).__name__}; allowed is a system such as drivetrain_jax.Cardan(...)"
-        )
+        given = f"the class {system.__name__}" if isinstance(system, type) else f"a {type(system).__name__}"
+        raise InputError(f"system: got {given}; allowed is a system such as drivetrain_jax.Cardan(...)")
     try:
         # The model first: only a system with one declares what the analysis takes from its class.
-        model = get_analysis(name).model(type(system))
-        analysis = get_analysis(name).for_system(type(system))
+        return get_analysis(name).model(type(system)), get_analysis(name).for_system(type(system))
     except KeyError:
         known = analyses_of(type(system))
         guess = did_you_mean(name, known)
         raise InputError(f"{name}: unknown to {system.name}{guess}; allowed is one of {', '.join(known)}") from None
+
+
+def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapping[str, Any]) -> tuple[_Job, Any]:
+    """The checked call, and its numbers as arrays."""
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise InputError("jax_enable_x64 = False: allowed is True, by jax.config.update or within jax.enable_x64(True)")
+    model, analysis = model_and_analysis(name, system)
     values = {key: value for key, value in system.values.items() if key in model.parameters}
     try:
         request = make_request(type(system), analysis, [outputs] if isinstance(outputs, str) else outputs, options)

@@ -286,7 +286,7 @@ def _point_sentence(
     words = (
         [verdict.capitalize()] if verdict != "undecided" else ["Undecided: the spectral radius is 1 within its error"]
     )
-    words += [line.strip().replace("  ", " ") for line in growth_lines(grows, 0, sign="")]
+    words += [line.strip() for line in growth_lines(grows, width=0, sign="")]
     speed = asked.atlas.scene.system.roles.get("speed")
     changes = [(each, c) for each in nearest for c in (each.below, each.above) if c]
     along = [(each, c) for each, c in changes if each.parameter == speed] or [
@@ -420,11 +420,10 @@ def _where_unstable(
     """The unstable ranges with the ``names`` of their resonances, and the damping that removes them, in one sentence."""
     k = part.parameters.index(speed)
     ends = float(part.lower[k]), float(part.upper[k])
-    whole = asked.span(speed, ends)
     if not found.unstable:
-        return f"Stable at {whole}{_but_undecided(found.undecided)}."
-    if not found.windows and not found.undecided:
-        return f"Unstable at {whole}."
+        # Without a stable range nothing is decided.
+        word = "Stable" if found.windows else "Undecided"
+        return f"{word} at {asked.span(speed, ends)}{_but_undecided(found.undecided if found.windows else ())}."
     label = asked.shown(speed, ends[0])[0]
     ranges = [
         asked.span(speed, (i.lower, i.upper)).removeprefix(f"{label} = ") + (f" ({word})" if word else "")
@@ -472,8 +471,8 @@ def _and(words: Sequence[str]) -> str:
 
 
 def _but_undecided(ranges: Sequence[Range]) -> str:
-    """What errors leave open, as the end of a sentence."""
-    return f"; {len(ranges)} narrow range{'s are' if len(ranges) > 1 else ' is'} undecided" if ranges else ""
+    """The number of undecided ``ranges``, as the end of a sentence."""
+    return f"; {len(ranges)} range{'s are' if len(ranges) > 1 else ' is'} undecided" if ranges else ""
 
 
 def _undecided(asked: AtlasQuery, name: str, ranges: Iterable[Range]) -> list[str]:
@@ -559,24 +558,21 @@ def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: des
         "check": _check(answer.check),
         **forced,
     }
-    return Reply(lines, data, _extreme_sentence(title, asked, answer))
+    return Reply(lines, data, _extreme_sentence(safe, asked, answer))
 
 
-def _extreme_sentence(title: str, asked: AtlasQuery, answer: design.Answer) -> str:
-    """The answer in one sentence."""
-    name, least = answer.parameter, title.startswith("least")
+def _extreme_sentence(safe: str, asked: AtlasQuery, answer: design.Answer) -> str:
+    """The answer in one sentence; ``safe`` is the stable end of the atlas, ``largest`` or ``smallest``."""
+    name, side, way = answer.parameter, *((1.0, "more") if safe == "largest" else (-1.0, "less"))
     speed = asked.atlas.scene.system.roles["speed"]
-    label = asked.shown(name, answer.safe_end)[0]
-    speeds = asked.span(speed, asked.values[speed])
+    label, speeds = asked.shown(name, answer.safe_end)[0], asked.span(speed, asked.values[speed])
     doubt = "" if answer.certain else " (not certain: some ranges are undecided)"
     if answer.value is not None:
-        value = asked.named(name, _rounded(answer, 1.0 if least else -1.0))
-        return f"With {value} or {'more' if least else 'less'}, {speeds} is stable{doubt}."
+        return f"With {asked.named(name, _rounded(answer, side))} or {way}, {speeds} is stable{doubt}."
     if not answer.stable:
         return f"{'No' if answer.certain else 'Perhaps no'} {label} of the atlas makes {speeds} stable."
     ranges = _and([asked.span(name, (i.lower, i.upper)) for i in answer.stable])
-    end = f"the {'largest' if least else 'smallest'} {label} of the atlas"
-    return f"With {ranges}, {speeds} is stable, at {end} it is not{doubt}."
+    return f"With {ranges}, {speeds} is stable; with the {safe} {label} of the atlas it is not{doubt}."
 
 
 def _elsewhere(safe: str, asked: AtlasQuery, answer: design.Answer) -> list[str]:

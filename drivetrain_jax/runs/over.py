@@ -22,7 +22,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax._units import with_unit
 from drivetrain_jax._wording import nearest, shown
-from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analysis_names, get_analysis
+from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analysis_names
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.analysis.request import checked
 from drivetrain_jax.runs.axes import Axis, AxisTable, entry_of, spread
@@ -84,14 +84,12 @@ def sweep(
     of_another_package = isinstance(function, analyses.AnalysisFunction)
     own = function.name if of_another_package else getattr(function, "__name__", "")
     if of_another_package or (own in analysis_names() and getattr(analyses, own, None) is function):
-        if not isinstance(system, System):
-            given = f"the class {system.__name__}" if isinstance(system, type) else f"a {type(system).__name__}"
-            raise InputError(f"system: got {given}; allowed is a system such as drivetrain_jax.Cardan(...)")
+        _, analysis = analyses.model_and_analysis(own, system)
         if system.name in system_names() and get_system(system.name) is type(system):
             return run(_scene_table(own, system, over, outputs, options), out=out, fresh=fresh)
         # A scene names its system, so any other class is that of a function.
-        known = get_analysis(own).for_system(type(system)).variables
-        return run(_function_scene(function, system, over, outputs, options, known), out=out, fresh=fresh)
+        scene = _function_scene(function, system, over, outputs, options, analysis.variables)
+        return run(scene, out=out, fresh=fresh)
     return run(_function_scene(function, system, over, outputs, options), out=out, fresh=fresh)
 
 
@@ -183,7 +181,8 @@ def _function_scene(
     variables = tuple(_variable(key, shapes[key], words.get(key)) for key in wanted)
     kind, analysis = _kind(_Once(one), name, tuple(values), type(system), variables, computes)
     axes = tuple(Axis(key, kind.parameter(key), None, numbers) for key, numbers in values.items())
-    names = [*(axis.dim for axis in axes), *wanted, *(dim for variable in variables for dim in variable.dims)]
+    dims = dict.fromkeys(dim for variable in variables for dim in variable.dims)
+    names = [*(axis.dim for axis in axes), *wanted, *dims]
     if double := [label for label in names if names.count(label) > 1]:
         raise InputError(f"over: {double[0]!r} names two dimensions or results; allowed are distinct names")
     text = f'system = "{kind.name}"\nanalysis = "{name}"\n\n[fixed]\n{_COMPUTES} = "{computes}"\n'
@@ -228,7 +227,8 @@ def _kind(
     def solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
         return (Solver(name, over_lanes(solve), chunk=_CHUNK),)
 
-    dimensions = tuple(Dimension(dim, f"number of the entry of {v.name}", ()) for v in variables for dim in v.dims)
+    entries = {dim: v.name for v in variables for dim in v.dims}
+    dimensions = tuple(Dimension(dim, f"number of the entry of {name}", ()) for dim, name in entries.items())
     body = {
         "name": FUNCTION,
         "title": of.__name__,
@@ -261,8 +261,7 @@ def _with_outcome(results: Mapping[str, Array], code: Array | None) -> dict[str,
 
 def _variable(name: str, shape: jax.ShapeDtypeStruct, described: Variable | None) -> Variable:
     dtype = "int8" if shape.dtype == bool else str(shape.dtype)
-    dims = tuple(f"{name}_{i}" for i in range(len(shape.shape)))
-    return replace(described, dims=dims) if described else Variable(name, "1", name, dims, dtype)
+    return described or Variable(name, "1", name, tuple(f"{name}_{i}" for i in range(len(shape.shape))), dtype)
 
 
 def _named(result: Any, name: str) -> dict[str, Array]:

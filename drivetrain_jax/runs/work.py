@@ -8,7 +8,7 @@ import time
 import uuid
 from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
@@ -360,29 +360,36 @@ class Work:
 
         missing = (block for block in job.blocks(points) if block.number not in done)
         try:
-            try:
-                # Closed on exit: after an interrupt nothing further starts.
-                with closing(self.executor.run(job, missing, self.store, first, tick)) as finished:
-                    for block, results in finished:
-                        results = self._received(job, block, results, first, receiver)
-                        done.add(block.number)
-                        outcome = results[OUTCOME.name]
-                        progress.count(outcome)
-                        progress.computed += outcome.size
-                        computed += outcome.size
-                        progress.cost = max(progress.cost, computed)
-                        self.report(progress)
-                if computed < progress.total_cost:
-                    raise RetryableError("some blocks returned no result")
-            except Exception:
-                # In a library's code an interrupt may end as an exception of that library: the report raises it again.
-                self.report(progress)
-                raise
+            # Closed on exit: after an interrupt nothing further starts.
+            with (
+                self._reported(progress),
+                closing(self.executor.run(job, missing, self.store, first, tick)) as finished,
+            ):
+                for block, results in finished:
+                    results = self._received(job, block, results, first, receiver)
+                    done.add(block.number)
+                    outcome = results[OUTCOME.name]
+                    progress.count(outcome)
+                    progress.computed += outcome.size
+                    computed += outcome.size
+                    progress.cost = max(progress.cost, computed)
+                    self.report(progress)
+            if computed < progress.total_cost:
+                raise RetryableError("some blocks returned no result")
         except KeyboardInterrupt:
             # It may come between storing a block and counting it.
             for _, results in self._stored(job, first, points, done):
                 progress.computed += results[OUTCOME.name].size
                 progress.count(results[OUTCOME.name])
+            raise
+
+    @contextmanager
+    def _reported(self, progress: Progress) -> Iterator[None]:
+        """Report before an exception passes: if it is an interrupt in a library's code, the report raises that again."""
+        try:
+            yield
+        except Exception:
+            self.report(progress)
             raise
 
     def _received(

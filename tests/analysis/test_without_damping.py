@@ -80,11 +80,11 @@ class Unregistered(dt.Cardan):
 
 def test_a_class_that_is_not_installed_is_swept(tmp_path):
     shaft = Unregistered(beta=0.5, Omega=2.0, zeta=0.1, alpha=1.0, mu=1.0, gamma=1.0)
-    outputs = ["spectral_radius", "verdict"]
+    outputs = ["spectral_radius", "verdict", "floquet_multiplier", "floquet_multiplier_error"]
     chart = dt.sweep(dt.floquet, shaft, over={"Omega": [1.0, 2.0]}, outputs=outputs, out=tmp_path / "chart.nc")
     assert chart.drivetrain.named().verdict.values.tolist() == ["unstable", "stable"]
     assert chart.verdict.attrs["long_name"] == "stability of the equilibrium"
-    assert set(chart.data_vars) == {*outputs, "outcome"}
+    assert set(chart.data_vars) == {*outputs, "outcome"} and chart.floquet_multiplier.dims == ("Omega", "multiplier")
     assert not [str(f) for f in check(chart) if f.broken] and dt.plot(chart).axes
 
 

@@ -125,6 +125,8 @@ def test_answers_begin_with_one_sentence_in_the_units_of_the_question():
     assert str(windows).startswith(windows.answer) and windows.sentences()[0] == windows.answer
     assert [each["resonance"] for each in windows.data["unstable"]] == ["subharmonic S21"]
     assert atlas_answers.speed_windows(atlas, {"beta": 0.05}).answer == "Stable at Omega = 1.3 to 1.5."
+    without = atlas_answers.speed_windows(atlas, {**data, "angle": 17.0}, margin=0.9)
+    assert without.data["windows"] == [] and without.answer == windows.answer
     widest = atlas_answers.widest_angle(atlas, {**data, "speed": (290.0, 320.0)})
     assert widest.answer == "With angle = 6.09241 deg (beta = 0.106333) or less, speed = 290 to 320 rpm is stable."
     asked = json.loads(atlas_answers.query(atlas, {**data, "angle": 17.0, "speed": 302.3}).to_json())["answer"]
@@ -400,7 +402,7 @@ def test_nothing_found_beside_undecided_ranges_is_not_nothing(monkeypatch):
         monkeypatch.setattr(design, "speed_windows", lambda *_, ends=undecided, **__: design.Windows((), (), ends))
         reply = atlas_answers.speed_windows(atlas, {"beta": 0.1})
         assert f"\n  none {text}" in str(reply)
-    assert reply.lines[2] == "  undecided: Omega = 0.5 to 0.6"
+    assert reply.lines[2] == "  undecided: Omega = 0.5 to 0.6" and reply.answer == "Undecided at Omega = 0.3 to 2."
 
 
 @pytest.mark.full
