@@ -151,8 +151,8 @@ def test_the_nearest_changes_are_those_of_query(atlases, pages):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(("name", "axes", "limit"), [("two", (0, 1), 100), ("four", (0, 1), 200)])
+@pytest.mark.parametrize(("name", "axes", "limit"), [("two", (0, 1), 1.8), ("four", (0, 1), 1.5)])
 def test_a_chart_is_redrawn_while_a_slider_moves(pages, name, axes, limit):
-    """512 x 512 cells, in milliseconds of one thread; a loaded machine is told by a plain loop, 35 ms on an idle one."""
+    """512 x 512 cells in multiples of a plain loop over arrays, which a slow or busy machine slows as much."""
     least = node(pages(name), "speed", *axes, 512, 25)
-    assert least["chart"] < limit * max(1.0, least["loop"] / 35), least
+    assert least["chart"] < limit * least["loop"], least
