@@ -219,8 +219,9 @@ _PIECE = 1 << 15
 _MAX_EFFORT, _BITS = 2**31 - 1, 32
 # Least number of chunks per solver in a small scene. A constant, because bits must not depend on the number of cores.
 _MIN_CHUNKS = 2
-# Points of the smallest chunk of more than one point.
-_LANES = 16
+# Points of the smallest chunk of more than one point, and predicted seconds of a chunk that is not divided: compiling
+# another kernel takes longer.
+_LANES, _BRIEF = 16, 0.02
 
 
 @dataclass(frozen=True)
@@ -274,7 +275,7 @@ def make_plan(
         keys = ((_MAX_EFFORT - effort[rows]) << _BITS) | rows
         keys.sort()
         rows = keys & ((1 << _BITS) - 1)
-        size = solver.chunk if full_size else chunk_size(solver.chunk, rows.size, solver.lengthy)
+        size = solver.chunk if full_size else chunk_size(solver, rows.size, int(effort[rows[0]]))
         for start in range(0, rows.size, size):
             part = rows[start : start + size]
             most = int(effort[part[0]])
@@ -282,15 +283,17 @@ def make_plan(
     return tuple(sorted(chunks, key=lambda chunk: -chunk.cost))
 
 
-def chunk_size(largest: int, count: int, lengthy: bool = False) -> int:
-    """Points per chunk for ``count`` points, at most ``largest``; fewer in small scenes, to give all cores work.
+def chunk_size(solver: Solver, count: int, effort: int = 1) -> int:
+    """Points per chunk for ``count`` points of at most this ``effort``; fewer in small scenes, to give all cores work.
 
-    Sizes are 1, 16 and larger powers of two, so that another count seldom needs another kernel. ``lengthy`` points, which
-    take long, may also have the sizes 2 to 8.
+    Sizes are 1, 16, that of the solver and powers of two between them where a chunk takes long, so that another count
+    seldom needs another kernel. Lengthy points may also have the sizes 2 to 8.
     """
+    if count > _LANES and effort * solver.seconds * solver.chunk < _BRIEF:
+        return solver.chunk
     share = count if count <= _LANES else -(-count // _MIN_CHUNKS)
-    least = 1 if lengthy or count == 1 else _LANES
-    return min(largest, max(least, 1 << (share - 1).bit_length()))
+    least = 1 if solver.lengthy or count == 1 else _LANES
+    return min(solver.chunk, max(least, 1 << (share - 1).bit_length()))
 
 
 def mean_cost(solvers: Sequence[Solver], grid: Grid, points: np.ndarray) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import toy
@@ -83,12 +85,19 @@ def test_extreme_efforts(effort, planned):
     [(256, 1, 1), (256, 3, 16), (256, 16, 16), (256, 17, 16), (256, 70, 64), (256, 1000, 256), (8, 1000, 8), (1, 5, 1)],
 )
 def test_chunk_size(largest, count, expected):
-    assert chunk_size(largest, count) == expected
+    solver = Solver("s", lambda *_: {}, seconds=1e-3, chunk=largest)
+    assert chunk_size(solver, count) == expected
+    assert chunk_size(replace(solver, seconds=1e-5), count, effort=100) == expected
+
+
+@pytest.mark.parametrize(("count", "expected"), [(1, 1), (16, 16), (17, 256), (1000, 256)])
+def test_a_chunk_that_takes_no_time_is_not_divided(count, expected):
+    assert chunk_size(Solver("s", lambda *_: {}, seconds=1e-5, chunk=256), count, effort=5) == expected
 
 
 @pytest.mark.parametrize(("count", "expected"), [(1, 1), (3, 4), (16, 16), (17, 16), (33, 32)])
 def test_lengthy_points_are_not_padded_to_a_whole_chunk(count, expected):
-    assert chunk_size(256, count, lengthy=True) == expected
+    assert chunk_size(Solver("s", lambda *_: {}, seconds=1.0, lengthy=True), count) == expected
 
 
 def test_grid_numbers_points_in_c_order():

@@ -315,7 +315,7 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     steps = partial(predicted_steps, build, n, len(_displacements(system).values))
     chunk = CHUNK if set(request.outputs) <= set(LINEAR) else ORBITS_CHUNK
     solve = over_lanes(partial(_solve, build, n, system.roles.get("speed", ""), request))
-    return (Solver("diffrax", solve, steps, seconds=5e-6, chunk=chunk, march=True, short_loops=True),)
+    return (Solver("diffrax", solve, steps, seconds=3e-5, chunk=chunk, march=True, short_loops=True),)
 
 
 # Results whose derivatives need second derivatives of the field: they come from differentiating the first solver.

@@ -252,7 +252,7 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     chunk = _SPECTRUM_CHUNK if set(request.outputs) <= _SPECTRUM else _MODES_CHUNK
     chunk = _LINES_CHUNK if request.options["track"] else chunk
     solve = partial(_solve, system.models["modes"].build, request)
-    return (Solver("singular values", solve, chunk=chunk, short_loops=True),)
+    return (Solver("singular values", solve, seconds=1e-4, chunk=chunk, short_loops=True),)
 
 
 def described(model: Model, fixed: Mapping[str, Any]) -> Any:
