@@ -17,8 +17,8 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import OUTCOME, Outcome, get_analysis
+from drivetrain_jax.analysis._base import make_request
 from drivetrain_jax.analysis.floquet import propagator
-from drivetrain_jax.analysis.request import make_request
 from drivetrain_jax.runs import kernel
 from drivetrain_jax.runs.kernel import compile_kernel, result_variables
 from drivetrain_jax.runs.resolve import resolve

@@ -15,7 +15,7 @@ from jax import Array
 
 from drivetrain_jax._machine import threads, usable_cores
 from drivetrain_jax.analysis.floquet.effort import stable_steps, steps_needed
-from drivetrain_jax.analysis.floquet.power_series import propagators_along
+from drivetrain_jax.analysis.numerics.collocation import propagators_along
 from drivetrain_jax.analysis.numerics.kernels import Words, compiler_options, predicted, split
 from drivetrain_jax.atlas.construction import MAX_SOLVES, Axes, Domain, Function, construct
 from drivetrain_jax.atlas.panels import Atlas, Panel

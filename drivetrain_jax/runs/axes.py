@@ -15,7 +15,7 @@ import numpy as np
 from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter
-from drivetrain_jax.analysis.request import checked
+from drivetrain_jax.analysis._base import checked
 
 if TYPE_CHECKING:
     from drivetrain_jax.runs.scene import Problem, Value

@@ -23,8 +23,8 @@ from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax._units import with_unit
 from drivetrain_jax._wording import nearest, shown
 from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analysis_names
+from drivetrain_jax.analysis._base import checked
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
-from drivetrain_jax.analysis.request import checked
 from drivetrain_jax.runs.axes import Axis, AxisTable, entry_of, spread
 from drivetrain_jax.runs.run import run
 from drivetrain_jax.runs.scene import FUNCTION, Scene

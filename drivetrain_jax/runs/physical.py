@@ -14,7 +14,7 @@ from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Parameter
 from drivetrain_jax._wording import clipped, shown
-from drivetrain_jax.analysis.request import checked
+from drivetrain_jax.analysis._base import checked
 from drivetrain_jax.runs.axes import Axis, entry_of
 from drivetrain_jax.systems import PhysicalData, System
 from drivetrain_jax.systems._base import Along

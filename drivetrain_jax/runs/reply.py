@@ -22,10 +22,10 @@ from drivetrain_jax._programs import compiled, program_identity
 from drivetrain_jax._quantities import Parameter
 from drivetrain_jax._wording import shown
 from drivetrain_jax.analysis import get_analysis
+from drivetrain_jax.analysis._base import checked, make_request
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
 from drivetrain_jax.analysis.numerics.kernels import options_for_few
 from drivetrain_jax.analysis.numerics.lanes import Constants
-from drivetrain_jax.analysis.request import checked, make_request
 from drivetrain_jax.runs.physical import GivenData, described
 from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.systems import System

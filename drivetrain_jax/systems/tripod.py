@@ -20,8 +20,7 @@ from jax import Array
 
 from drivetrain_jax._quantities import Component, Variable
 from drivetrain_jax.systems._base import Number, System, Values, parameter, serves
-from drivetrain_jax.systems._models import Components, FloquetModel, Flow, LinearPeriodic, Rows
-from drivetrain_jax.systems.trigonometry import cos, sin
+from drivetrain_jax.systems._models import Components, FloquetModel, Flow, LinearPeriodic, Rows, cos, sin
 
 # Default parameters from tables 1, 2 and 4 of the paper, and conflicts between them.
 

@@ -13,7 +13,7 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.analysis.floquet.power_series import propagators_along
+from drivetrain_jax.analysis.numerics.collocation import propagators_along
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System, parameter, serves
 from tests.sizes import full_after
 

@@ -16,8 +16,7 @@ import drivetrain_jax as dt
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import Outcome, Request, get_analysis
 from drivetrain_jax.analysis.forced import orbit
-from drivetrain_jax.analysis.forced.amplitude import _cubic_root, amplitudes
-from drivetrain_jax.analysis.forced.analysis import predicted_steps
+from drivetrain_jax.analysis.forced.analysis import _cubic_root, amplitudes, predicted_steps
 from drivetrain_jax.analysis.forced.orbit import integrate, shoot
 from drivetrain_jax.systems import ForcedModel, get_system
 from tests.quick_jit import quick_jit

@@ -15,10 +15,9 @@ import pytest
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import Outcome, Request
 from drivetrain_jax.analysis.lyapunov import section_measures
-from drivetrain_jax.analysis.lyapunov.analysis import analyse
+from drivetrain_jax.analysis.lyapunov.analysis import Verdict, analyse
 from drivetrain_jax.analysis.lyapunov.orbit import may_be_chaotic
 from drivetrain_jax.analysis.lyapunov.variational import needed_steps
-from drivetrain_jax.analysis.lyapunov.verdict import Verdict
 from drivetrain_jax.invariants import check
 from drivetrain_jax.systems import Flow, get_system
 from tests.oracles import tripod_reference as oracle

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
-from drivetrain_jax.analysis.floquet.power_series import propagators_along
+from drivetrain_jax.analysis.numerics.collocation import propagators_along
 from drivetrain_jax.systems import LinearPeriodic
 from tests.oracles.atlas_direct import BASE, CARDAN, monodromy, propagators
 

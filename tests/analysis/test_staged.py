@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from drivetrain_jax.analysis.floquet.propagator import staged
 from drivetrain_jax.analysis.numerics.kernels import _operations
-from drivetrain_jax.analysis.numerics.staged import staged
 
 LANES = 5
 TIMES = jnp.linspace(0.0, 1.0, 3)[:, None]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 import pytest
 
+from drivetrain_jax.analysis.lyapunov.analysis import Evidence, Verdict, judge
 from drivetrain_jax.analysis.lyapunov.growth_record import adds_up, same_exponent
-from drivetrain_jax.analysis.lyapunov.verdict import Evidence, Verdict, judge
 
 CHAOTIC = Evidence(
     spectrum=jnp.array([1.0, -3.0]), error=jnp.array([0.1, 0.1]), coarse=jnp.array(1.0), coarse_error=jnp.array(0.1),

@@ -6,7 +6,7 @@ import jax
 import mpmath
 import numpy as np
 
-from drivetrain_jax.systems.trigonometry import cos, sin, sincos
+from drivetrain_jax.systems._models import cos, sin, sincos
 
 ANGLES = np.concatenate([np.random.default_rng(1).uniform(-(2.0**k), 2.0**k, 400) for k in (-3, 0, 3, 10, 20)])
 

@@ -15,8 +15,8 @@ from jax.tree_util import Partial
 
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver
+from drivetrain_jax.analysis.floquet.analysis import direct_solvers
 from drivetrain_jax.analysis.floquet.direct import Monodromy
-from drivetrain_jax.analysis.floquet.direct_solvers import direct_solvers
 from drivetrain_jax.analysis.floquet.results import VARIABLES, lacks
 from drivetrain_jax.systems import System
 

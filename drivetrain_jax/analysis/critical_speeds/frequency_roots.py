@@ -32,7 +32,7 @@ from drivetrain_jax.analysis.critical_speeds.mechanisms import (
 from drivetrain_jax.analysis.critical_speeds.segments import Scales
 from drivetrain_jax.analysis.numerics.kernels import stored
 from drivetrain_jax.systems import Shaft
-from drivetrain_jax.systems.trigonometry import sincos
+from drivetrain_jax.systems._models import sincos
 
 MAX_STEPS = 90
 # After this many steps some 5 % of the brackets are open.

@@ -11,7 +11,7 @@ from jax import Array
 
 from drivetrain_jax.analysis.critical_speeds.mechanisms import highest_frequency
 from drivetrain_jax.systems import Shaft
-from drivetrain_jax.systems.trigonometry import horner, sincos
+from drivetrain_jax.systems._models import horner, sincos
 
 # Phase of a segment without mass over that of all others, where it need only be negligible: its effect is the fourth power.
 _FAINT = 1e-12

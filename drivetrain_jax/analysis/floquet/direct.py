@@ -4,8 +4,7 @@ With a scheme of order p, r times as many steps reduce the error by ``r^p``: the
 difference over ``r^p - 1``. The bound is four times that error, measured on the matrix and on the coefficients of its
 characteristic polynomial; the larger one counts, because either may vanish by accident. The determinant is compared with
 Liouville's exact value; schemes that keep the determinant without damping need another check of a missed oscillation
-(``Propagator.undamped``). All functions broadcast over a trailing
-batch, and may be part of a kernel.
+(``Propagator.undamped``). All functions broadcast over a trailing batch, and may be part of a kernel.
 """
 
 from __future__ import annotations

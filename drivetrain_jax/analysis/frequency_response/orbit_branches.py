@@ -20,7 +20,7 @@ from jax import Array
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.analysis._base import Outcome, Request, Solver
 from drivetrain_jax.analysis.forced.analysis import NEAR, SAME, STABLE_MARGIN, distinct, orbits_near
-from drivetrain_jax.analysis.forced.coexisting import REACH, speed_map
+from drivetrain_jax.analysis.forced.orbit import REACH, speed_map
 from drivetrain_jax.analysis.impacts.motion import ABSENT, STABILITY, STABLE, UNSTABLE
 from drivetrain_jax.analysis.numerics.branch_sections import course, sections
 from drivetrain_jax.analysis.numerics.continuation import folds_and_doublings, follow

@@ -36,7 +36,7 @@ from drivetrain_jax.analysis.impacts.piecewise_march import (
     usual_steps,
 )
 from drivetrain_jax.systems import PiecewiseLinearOscillator
-from drivetrain_jax.systems.trigonometry import sincos
+from drivetrain_jax.systems._models import sincos
 
 _NODES, _WEIGHTS = (x.tolist() for x in np.polynomial.legendre.leggauss(8))
 _LONGEST_ARC = 2.0

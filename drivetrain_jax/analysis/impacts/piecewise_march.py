@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.systems import PiecewiseLinearOscillator, UnderdampedOscillator
-from drivetrain_jax.systems.trigonometry import sincos
+from drivetrain_jax.systems._models import sincos
 
 # Closed-form flow of a :class:`~drivetrain_jax.systems.PiecewiseLinearOscillator` within one linear region, and the
 # longest step that certainly stays in the region. All functions act on lanes: arrays of one shape ``(N,)``.

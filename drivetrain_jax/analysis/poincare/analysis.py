@@ -8,8 +8,7 @@ steps of order 8. The method ``adaptive`` shows the effect of loose tolerances: 
 Both methods estimate their errors. ``strobe_error`` is the error within one strobe of the section: some strobes, including
 the first ones, are repeated with finer equal steps (twice as many as ``fixed``, 96 after ``adaptive``). ``section_error`` is
 the accumulated error since the start: the whole motion is repeated with equal steps (a quarter as many, 48 after
-``adaptive``; after ``fixed`` twice as many in doubtful cases). See
-:mod:`~drivetrain_jax.analysis.poincare.analysis`.
+``adaptive``; after ``fixed`` twice as many in doubtful cases).
 
 Outcome: ``TOLERANCE_NOT_MET`` if ``section_error`` exceeds 1e-6 or ten times ``rtol``, or is unknown. Every long section of
 a chaotic motion has this outcome, because errors grow to the size of the motion; ``strobe_error`` then shows if its strobes
