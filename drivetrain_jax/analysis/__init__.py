@@ -18,22 +18,23 @@ if TYPE_CHECKING:
     from drivetrain_jax.analysis.numerics.lanes import over_lanes
     from drivetrain_jax.systems import System
 
-_BUILT_IN = (
-    "floquet",
-    "atlas",
-    "forced",
-    "frequency_response",
-    "history",
-    "lyapunov",
-    "poincare",
-    "parameters",
-    "phasing",
-    "modes",
-    "harmonic_response",
-    "steady_state",
-    "basins",
-    "critical_speeds",
-)
+# Modules of this package and the names of the analyses in them.
+_BUILT_IN = {
+    "floquet": "floquet.analysis:ANALYSIS",
+    "atlas": "atlas:ANALYSIS",
+    "forced": "forced.analysis:ANALYSIS",
+    "frequency_response": "frequency_response.analysis:ANALYSIS",
+    "history": "history.analysis:ANALYSIS",
+    "lyapunov": "lyapunov.analysis:ANALYSIS",
+    "poincare": "poincare.analysis:ANALYSIS",
+    "parameters": "constants:PARAMETERS",
+    "phasing": "constants:PHASING",
+    "modes": "modes.analysis:ANALYSIS",
+    "harmonic_response": "harmonic_response.analysis:ANALYSIS",
+    "steady_state": "steady_state.analysis:ANALYSIS",
+    "basins": "basins.analysis:ANALYSIS",
+    "critical_speeds": "critical_speeds.analysis:ANALYSIS",
+}
 
 __all__ = [
     "OUTCOME",
@@ -68,7 +69,8 @@ def analysis_names() -> tuple[str, ...]:
 def get_analysis(name: str) -> Analysis:
     """The analysis ``name``; ``KeyError`` with the known names if there is none, ``ImportError`` if its package fails."""
     if name in _BUILT_IN:
-        return import_module(f"drivetrain_jax.analysis.{name}.analysis").ANALYSIS
+        module, _, record = _BUILT_IN[name].partition(":")
+        return getattr(import_module(f"{__name__}.{module}"), record)
     from drivetrain_jax.analysis._base import Analysis
 
     found = load_plugin(ANALYSES, name, "an analysis", lambda x: isinstance(x, Analysis))

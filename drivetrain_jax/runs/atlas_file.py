@@ -16,7 +16,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import counted, did_you_mean, shown
 from drivetrain_jax.analysis import OUTCOME, Request, get_analysis
 from drivetrain_jax.analysis._base import make_request
-from drivetrain_jax.analysis.atlas.analysis import ANALYSIS
+from drivetrain_jax.analysis.atlas import ANALYSIS
 from drivetrain_jax.atlas import StabilityAtlas, from_arrays, stability_atlas, to_arrays
 from drivetrain_jax.atlas.floquet import floquet_domain
 from drivetrain_jax.runs.assemble import ResultBuffer, labelled, result_attrs, to_dataset

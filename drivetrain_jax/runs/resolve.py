@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.analysis.atlas.analysis import ANALYSIS
+from drivetrain_jax.analysis.atlas import ANALYSIS
 from drivetrain_jax.runs.axes import MAX_RANGES, Grid, entry_of
 from drivetrain_jax.runs.job import Job, mean_cost
 from drivetrain_jax.runs.scene import Ranges, Scene, atlas_ranges

@@ -20,7 +20,7 @@ import drivetrain_jax
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._wording import clipped, counted
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.analysis.atlas.analysis import ANALYSIS
+from drivetrain_jax.analysis.atlas import ANALYSIS
 from drivetrain_jax.runs.assemble import misfits, sweep_first
 from drivetrain_jax.runs.axes import Grid, entry_of
 from drivetrain_jax.runs.job import Job, scene_content

@@ -60,7 +60,7 @@ STORE = ["--store", "zarr"]
 # Modules that the commands import late, and that start no thread.
 MODULES = ("matplotlib.pyplot", "xarray", "zarr", "h5netcdf", "diffrax", "drivetrain_jax.systems.cardan")
 MODULES += ("drivetrain_jax.runs.run", "drivetrain_jax.runs.assemble", "drivetrain_jax.invariants")
-MODULES += ("drivetrain_jax.analysis.floquet.propagator", "drivetrain_jax.analysis.atlas.analysis")
+MODULES += ("drivetrain_jax.analysis.floquet.propagator", "drivetrain_jax.analysis.atlas")
 
 
 def run(name: str, out: str, *more: str) -> list[str]:

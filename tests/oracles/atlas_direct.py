@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drivetrain_jax.analysis import Request, Solver
-from drivetrain_jax.analysis.atlas.analysis import SOLVES
+from drivetrain_jax.analysis.atlas import SOLVES
 from drivetrain_jax.analysis.numerics.kernels import compiler_options
 from drivetrain_jax.atlas import StabilityAtlas, floquet_atlas, solve_rtol, stability_atlas
 from drivetrain_jax.systems import get_system

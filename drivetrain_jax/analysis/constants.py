@@ -90,4 +90,6 @@ def constants(name: str, title: str) -> Analysis:
     )
 
 
-ANALYSIS = constants("parameters", "constants of the system")
+PARAMETERS = constants("parameters", "constants of the system")
+# Uneven rotation of a rigid driveline, and the phases of its yokes that minimise it.
+PHASING = constants("phasing", "phases of the yokes")

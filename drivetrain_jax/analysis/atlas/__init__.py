@@ -1,1 +1,0 @@
-"""The stability atlas as an analysis: solves at the nodes of its panels."""

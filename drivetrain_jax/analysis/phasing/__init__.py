@@ -1,1 +1,0 @@
-"""Constants of a system in closed form."""
