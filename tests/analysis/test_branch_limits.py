@@ -10,7 +10,7 @@ from drivetrain_jax.analysis.frequency_response import analysis as frequency_res
 from drivetrain_jax.analysis.frequency_response import harmonic_response
 from drivetrain_jax.analysis.impacts import exact_response
 from drivetrain_jax.analysis.numerics import continuation
-from drivetrain_jax.analysis.numerics.branch_sections import distinct
+from drivetrain_jax.analysis.numerics.continuation import distinct
 from drivetrain_jax.systems import rattle
 from tests.quick_jit import quick_jit
 

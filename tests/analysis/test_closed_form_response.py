@@ -16,7 +16,7 @@ from drivetrain_jax.analysis.frequency_response import (
     closed_form_response,
     describing_function,
 )
-from drivetrain_jax.analysis.numerics.branch_sections import follow, refined
+from drivetrain_jax.analysis.frequency_response.describing_function import follow, refined
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
 from tests.quick_jit import quick_jit
 from tests.sizes import full_after

@@ -15,10 +15,9 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis.critical_speeds.analysis import separation_margin
-from drivetrain_jax.analysis.critical_speeds.compound import characteristic
+from drivetrain_jax.analysis.critical_speeds.compound import characteristic, compound, general
 from drivetrain_jax.analysis.critical_speeds.frequency_roots import find_roots, relative_error
 from drivetrain_jax.analysis.critical_speeds.mechanisms import zero_modes
-from drivetrain_jax.analysis.critical_speeds.segments import compound, general
 from drivetrain_jax.systems import Shaft
 from drivetrain_jax.systems.bicardan import PRESETS, Bicardan
 from tests.oracles.bicardan_reference import complete, finite_elements

@@ -22,14 +22,13 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis._base import stacked
-from drivetrain_jax.analysis.critical_speeds.compound import characteristic, pairings
+from drivetrain_jax.analysis.critical_speeds.compound import Scales, characteristic, pairings
 from drivetrain_jax.analysis.critical_speeds.mechanisms import (
     highest_frequency,
     is_undefined,
     number_of_modes,
     zero_modes,
 )
-from drivetrain_jax.analysis.critical_speeds.segments import Scales
 from drivetrain_jax.analysis.numerics.kernels import stored
 from drivetrain_jax.systems import Shaft
 from drivetrain_jax.systems._models import sincos

@@ -19,8 +19,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.critical_speeds.compound import hinge_shares, planes, rotation_shares, support_shares
-from drivetrain_jax.analysis.critical_speeds.segments import Plane, Scales, Waves, between, even_and_odd, split_inertia
+from drivetrain_jax.analysis.critical_speeds.compound import (
+    Plane,
+    Scales,
+    Waves,
+    between,
+    even_and_odd,
+    hinge_shares,
+    planes,
+    rotation_shares,
+    split_inertia,
+    support_shares,
+)
 from drivetrain_jax.analysis.numerics.linear_algebra import looped_matmul, matmul, solve
 from drivetrain_jax.analysis.numerics.singular_values import jacobi_vectors
 from drivetrain_jax.systems import Shaft

@@ -17,8 +17,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from drivetrain_jax.analysis._base import Outcome
-from drivetrain_jax.analysis.numerics.branch_sections import course, sections
-from drivetrain_jax.analysis.numerics.continuation import Mapped, follow
+from drivetrain_jax.analysis.numerics.continuation import Mapped, course, follow, sections
 from drivetrain_jax.analysis.numerics.linear_algebra import solve
 from drivetrain_jax.systems import ForcedModel
 

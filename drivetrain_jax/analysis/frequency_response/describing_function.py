@@ -1,7 +1,7 @@
 """Bias and fundamental of the oscillator with play, ``u = m + A cos(omega t - phi)``, by its describing function.
 
-With ``p = (b - m)/A``, ``q = (b + m)/A`` and the moments h0, h1 of a clipped cosine (``moments`` in
-``equivalent_stiffness.py``), balance of mean and fundamental gives, in units of ``k' = k/I`` and ``c' = c/I``,
+With ``p = (b - m)/A``, ``q = (b + m)/A`` and the :func:`moments` h0, h1 of a clipped cosine, balance of mean and
+fundamental gives, in units of ``k' = k/I`` and ``c' = c/I``,
 
     alpha m + (1 - alpha) A [h0(p) - h0(q)] = B0/k'                         the bias m(A), monotone in m
     kappa(A) = k' [alpha + (1 - alpha) (h1(p) + h1(q))]                     the equivalent stiffness
@@ -23,14 +23,78 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.numerics.branch_sections import bisect, first_marks, sign_changes, take
+from drivetrain_jax.analysis.numerics.continuation import first_marks, sign_changes
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
-# Bias and equivalent stiffness of the oscillator with play at an amplitude, for its describing function.
+# Stationary amplitudes of one-term approximations: all amplitudes at a frequency, and those of a slow sweep.
 #
-# Symbols and equations: :mod:`~drivetrain_jax.analysis.frequency_response.describing_function`.
+# Both closed-form approximations of a forced oscillator end in one equation for the amplitude A of the fundamental,
+# ``residual(A, omega) = 0``. The residual is negative at A = 0 and positive for large A. The averaged amplitude grows
+# where the residual is negative and falls where it is positive: the first, third, ... root is stable, every second root
+# a saddle. Arrays have the batch as their trailing axes ``(...)``.
+
+
+def refined(omega: np.ndarray, largest: float, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rising frequencies that contain ``omega``, and the position of each entry of ``omega`` in them.
+
+    Steps are at most the fraction ``largest`` of the frequency, with at most ``most`` parts of one interval.
+    """
+    rising = np.unique(omega)
+    ratio = np.log(rising[1:] / rising[:-1])
+    parts = np.clip(np.ceil(ratio / largest), 1, most).astype(int)
+    pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(rising[:-1], rising[1:], parts, strict=True)]
+    fine = np.concatenate([*pieces, rising[-1:]])
+    return fine, np.searchsorted(fine, omega)
+
+
+def bisect(function: Callable[[Array], Array], low: Array, high: Array, halvings: int = 60) -> Array:
+    """The point between ``low`` and ``high`` at which ``function`` becomes positive."""
+
+    def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bracket
+        middle = (low + high) / 2
+        above = function(middle) > 0
+        return jnp.where(above, low, middle), jnp.where(above, middle, high)
+
+    low, high = jax.lax.fori_loop(0, halvings, halve, (low, high))
+    return (low + high) / 2
+
+
+def take(mask: Array, values: Array, missing: float = np.nan) -> Array:
+    """The entry of ``values`` (K, ...) that each row of ``mask`` (n, K, ...) marks; ``missing`` where it marks none."""
+    picked = jnp.sum(jnp.where(mask, values, 0.0), axis=1)
+    return jnp.where(jnp.any(mask, axis=1), picked, missing)
+
+
+def follow(roots: Array) -> Array:
+    """Indices of the roots of a sweep up and a sweep down, ``(L, K, ...) -> (L, 2, ...)``.
+
+    ``roots`` rise along K and are padded with infinity; frequencies rise along L. A sweep starts from rest. Between folds
+    the number of roots is constant, and the sweep keeps its position among them, even on steep branches. At the first
+    frequency past a fold the amplitude changes like the averaged motion: to the next root above if the residual at the old
+    amplitude is negative, to the next root below if it is positive.
+    """
+    size = roots.shape[1]
+
+    def move(state: tuple[Array, Array, Array], at: Array) -> tuple[tuple[Array, Array, Array], Array]:
+        amplitude, place, before = state
+        below = jnp.sum(at < amplitude, axis=0)
+        number = jnp.sum(jnp.isfinite(at), axis=0)
+        index = jnp.where(number == before, place, jnp.minimum(2 * (below // 2), size - 1))
+        reached = jnp.take_along_axis(at, index[None], axis=0)[0]
+        return (jnp.where(jnp.isfinite(reached), reached, amplitude), index, number), index
+
+    nowhere = jnp.zeros_like(jnp.sum(jnp.isfinite(roots[0]), axis=0))
+    rest = (jnp.zeros_like(roots[0, 0]), nowhere, nowhere)
+    up = jax.lax.scan(move, rest, roots)[1]
+    down = jax.lax.scan(move, rest, roots, reverse=True)[1]
+    return jnp.stack([up, down], axis=1)
+
+
+# Bias and equivalent stiffness at an amplitude.
 
 
 _BIAS_STEPS = 24

@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis._base import Outcome
+from drivetrain_jax.analysis.frequency_response.describing_function import refined
 from drivetrain_jax.analysis.frequency_response.harmonic_balance import (
     Balanced,
     Basis,
@@ -26,8 +27,7 @@ from drivetrain_jax.analysis.frequency_response.harmonic_balance import (
     spectral_radius,
 )
 from drivetrain_jax.analysis.impacts.motion import ABSENT, STABLE, UNSTABLE, imbalance, phase_lag, regime
-from drivetrain_jax.analysis.numerics.branch_sections import Course, course, distinct, refined, sections
-from drivetrain_jax.analysis.numerics.continuation import Mapped, follow
+from drivetrain_jax.analysis.numerics.continuation import Course, Mapped, course, distinct, follow, sections
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 # Most steps of a branch, failed ones included, and the longest step in scaled units.

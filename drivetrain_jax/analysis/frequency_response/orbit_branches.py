@@ -22,8 +22,7 @@ from drivetrain_jax.analysis._base import Outcome, Request, Solver
 from drivetrain_jax.analysis.forced.analysis import NEAR, SAME, STABLE_MARGIN, distinct, orbits_near
 from drivetrain_jax.analysis.forced.orbit import REACH, speed_map
 from drivetrain_jax.analysis.impacts.motion import ABSENT, STABILITY, STABLE, UNSTABLE
-from drivetrain_jax.analysis.numerics.branch_sections import course, sections
-from drivetrain_jax.analysis.numerics.continuation import folds_and_doublings, follow
+from drivetrain_jax.analysis.numerics.continuation import course, folds_and_doublings, follow, sections
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.systems import ForcedModel, System
 

@@ -7,7 +7,7 @@ own pace, so a lane that settles slowly, or never, does not delay the others.
 A lane settles period by period and from time to time tries Newton shooting from its state: ``z <- z + (1 - M)^-1 (F^m(z) -
 z)``, where M is the exact transition matrix over m periods and the motion nearly recurs after m periods. An orbit is
 accepted as the attractor under two conditions: all its multipliers lie inside the unit circle, and the motion, continued
-from the start of the search, approaches the orbit (:mod:`~drivetrain_jax.analysis.impacts.attractor_lanes`).
+from the start of the search, approaches the orbit.
 """
 
 from __future__ import annotations
@@ -20,28 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.impacts.attractor_lanes import (
-    MOST_PERIODS,
-    Lane,
-    Orbit,
-    approach,
-    attracts,
-    blank,
-    candidates,
-    confirm,
-    enter,
-    is_slow,
-    linearisation_holds,
-    reach,
-    record,
-    restart,
-    resume,
-    search,
-    select,
-    settle,
-    try_line,
-)
-from drivetrain_jax.analysis.impacts.motion import Matrix, log_determinant, newton_correction
+from drivetrain_jax.analysis.impacts.motion import Matrix, apply, log_determinant, newton_correction, spectral_radius
 from drivetrain_jax.analysis.impacts.piecewise_march import (
     FEW,
     Lanes,
@@ -53,6 +32,361 @@ from drivetrain_jax.analysis.impacts.piecewise_march import (
     stays,
 )
 from drivetrain_jax.systems import PiecewiseLinearOscillator
+
+# Lanes on their way to attractors: they settle period by period, start searches, and confirm the results.
+#
+# A *lane* processes one point at a time, stores the states of the last 33 periods to guess the period multiple, and
+# accumulates the growth of a tangent for the Lyapunov exponent.
+
+
+# Decide if a motion approaches a periodic orbit that Newton's method found from one of its states.
+#
+# Newton's method may converge to an orbit whose basin does not contain the state. One recurrence that agrees with the
+# linearisation about the orbit proves nothing, because the remainder is a vector that vanishes at some points.
+# Therefore the motion is continued. With M the transition matrix about the orbit ``z*``, rho its spectral radius and m
+# the period multiple, every recurrence must satisfy
+#
+#     |F^m(z) - z* - M (z - z*)| <= 0.02 (1 - rho) |z - z*|
+#
+# until the visited points enclose the rest of the way. With complex multipliers of argument theta the motion passes
+# through all directions within ``max(2 pi/theta, pi/(pi - theta))`` recurrences. The gaps between these directions, at
+# most 120 degrees, count as closed after the distance has shrunk by ``cos(gap/2)``. With real multipliers the faster
+# component must have shrunk by a factor of 30 relative to the other. In any case a decrease of the distance by this
+# factor is enough.
+#
+# Near a fold or a period doubling rho is nearly 1, and this test would need thousands of periods. The motion then moves
+# slowly along one line, the direction of the slow multiplier. The map shows that no other orbit lies on this line: from
+# each of eight points between the orbit and the motion, one recurrence (two if the multiplier is negative) must lead
+# nearer to the orbit.
+
+
+# Tolerated remainder of the linearisation relative to the contraction 1 - rho.
+REMAINDER = 0.02
+# Distance at which the motion has arrived, relative to its distance from the flank.
+_ARRIVED = 1e-9
+_DECAY = np.log(30.0)
+# A slow approach: least modulus of the slow multiplier, largest ratio of the fast multiplier to the slow one, and largest
+# distance of the motion from the slow line relative to its distance from the orbit.
+_SLOW, _APART, _OFF = 0.9, 0.9, 0.1
+# Number of points tested on the slow line, and their least contraction as a fraction of 1 - rho.
+PROBES, _PULL = 8, 0.2
+
+
+class Orbit(NamedTuple):
+    """An orbit through ``u, v``, each field ``(width,)``: the transition ``matrix`` over its period, the logarithm of the
+    determinant of the matrix, and the estimated ``error`` of u."""
+
+    u: Array
+    v: Array
+    matrix: Matrix
+    log_determinant: Array
+    error: Array
+
+
+def attracts(orbit: Orbit) -> Array:
+    """True if all multipliers lie inside the unit circle."""
+    return spectral_radius(orbit.matrix, orbit.log_determinant) < 1
+
+
+def recurrences(orbit: Orbit) -> Array:
+    """Number of recurrences that must satisfy the linearisation (module docstring), at least 2."""
+    rho = spectral_radius(orbit.matrix, orbit.log_determinant)
+    half = (orbit.matrix[0] + orbit.matrix[3]) / 2
+    gap = half**2 - jnp.exp(orbit.log_determinant)
+    angle = jnp.arctan2(jnp.sqrt(jnp.maximum(-gap, 0.0)), half)
+    apart = jnp.maximum(2 * jnp.log(rho) - orbit.log_determinant, 1e-300)
+    decay = jnp.maximum(-jnp.log(rho), 1e-300)
+    rest = jnp.maximum(np.pi - angle, 1e-300)
+    turn = jnp.maximum(2 * np.pi / jnp.maximum(angle, 1e-300), np.pi / rest)
+    turn = turn - jnp.log(jnp.cos(jnp.minimum(angle / 2, rest))) / decay
+    needed = jnp.minimum(jnp.where(gap < 0, turn, _DECAY / apart), _DECAY / decay)
+    return jnp.maximum(jnp.ceil(needed), 2.0)
+
+
+def reach(u: Array, v: Array, flank: Any, omega: Array) -> Array:
+    """Size of a motion through ``(u, v)``, from the flank: at a wide backlash the motion may be far from the origin."""
+    return jnp.abs(jnp.abs(u) - flank) + jnp.abs(v) / omega
+
+
+def linearisation_holds(
+    orbit: Orbit, before: tuple[Array, Array], after: tuple[Array, Array], flank: Any, omega: Array
+) -> tuple[Array, Array]:
+    """Flags where ``after``, one recurrence after ``before``, agrees with the linearisation, and flags of arrival."""
+    rho = spectral_radius(orbit.matrix, orbit.log_determinant)
+    away = (before[0] - orbit.u, before[1] - orbit.v)
+    ahead = apply(orbit.matrix, *away)
+    rest = jnp.abs(after[0] - orbit.u - ahead[0]) + jnp.abs(after[1] - orbit.v - ahead[1]) / omega
+    distance = jnp.abs(away[0]) + jnp.abs(away[1]) / omega
+    arrived = distance <= _ARRIVED * reach(orbit.u, orbit.v, flank, omega) + orbit.error
+    return (rest <= REMAINDER * (1 - rho) * distance) | arrived, arrived
+
+
+def along(orbit: Orbit, away: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Component of ``away`` along the slow line: the projection ``(M - mu_fast)/(mu_slow - mu_fast)`` (real mu only)."""
+    half = (orbit.matrix[0] + orbit.matrix[3]) / 2
+    root = jnp.sqrt(jnp.maximum(half**2 - jnp.exp(orbit.log_determinant), 0.0))
+    slow, fast = jnp.where(half < 0, half - root, half + root), jnp.where(half < 0, half + root, half - root)
+    moved = apply(orbit.matrix, *away)
+    return tuple((m - fast * x) / (slow - fast) for m, x in zip(moved, away, strict=True))  # pyright: ignore[reportReturnType]
+
+
+def is_slow(orbit: Orbit, state: tuple[Array, Array], omega: Array) -> Array:
+    """Flags where the motion in ``state`` moves slowly towards the orbit along the slow line."""
+    half = (orbit.matrix[0] + orbit.matrix[3]) / 2
+    rho, real = spectral_radius(orbit.matrix, orbit.log_determinant), half**2 > jnp.exp(orbit.log_determinant)
+    away = (state[0] - orbit.u, state[1] - orbit.v)
+    part = along(orbit, away)
+    off = jnp.abs(away[0] - part[0]) + jnp.abs(away[1] - part[1]) / omega
+    distance = jnp.abs(away[0]) + jnp.abs(away[1]) / omega
+    apart = jnp.exp(orbit.log_determinant) <= _APART * rho**2
+    return real & (rho > _SLOW) & (rho < 1) & apart & (off <= _OFF * distance)
+
+
+def doubled(orbit: Orbit) -> tuple[Orbit, Array]:
+    """The orbit, over two periods where its slow multiplier is negative, and flags of these lanes.
+
+    Over one period a motion near such an orbit changes sides, and the orbit may attract from one side only.
+    """
+    a, b, c, d = orbit.matrix
+    negative = a + d < 0
+    square = (a * a + b * c, b * (a + d), c * (a + d), b * c + d * d)
+    matrix = tuple(jnp.where(negative, new, old) for new, old in zip(square, orbit.matrix, strict=True))
+    return orbit._replace(matrix=matrix, log_determinant=jnp.where(negative, 2, 1) * orbit.log_determinant), negative
+
+
+def probe(orbit: Orbit, state: tuple[Array, Array], number: Array) -> tuple[Array, tuple[Array, Array]]:
+    """Point ``number`` of the line, from 0: its position (0 the orbit, 1 ``state``) and its state."""
+    place = (number + 1) / PROBES
+    return place, (orbit.u + place * (state[0] - orbit.u), orbit.v + place * (state[1] - orbit.v))
+
+
+def is_attracted(
+    orbit: Orbit, state: tuple[Array, Array], place: Array, after: tuple[Array, Array], omega: Array
+) -> Array:
+    """Flags where ``after``, one recurrence after the point ``place`` of the line to ``state``, lies nearer to the orbit on
+    the same side."""
+    rho = spectral_radius(orbit.matrix, orbit.log_determinant)
+    unit = along(orbit, (state[0] - orbit.u, state[1] - orbit.v))
+    there = along(orbit, (after[0] - orbit.u, after[1] - orbit.v))
+    product = there[0] * unit[0] + there[1] * unit[1] / omega**2
+    reached = product / (unit[0] ** 2 + unit[1] ** 2 / omega**2) / place
+    return (reached > 0) & (reached <= 1 - _PULL * (1 - rho))
+
+
+MOST_PERIODS = 32
+# Ratios to the best recurrence up to which another one counts as equally good: generous and narrow.
+_NEAR, _NARROW = 30.0, 1.5
+# Recurrences for which an orbit is kept although the motion does not yet satisfy the linearisation about it.
+_PATIENCE = 8
+_ROWS = np.arange(MOST_PERIODS + 1, dtype=np.int32)[:, None]
+
+
+class Lane(NamedTuple):
+    """State of the lanes, each field ``(width, ...)``: job, place in the job, motion, and search in progress."""
+
+    job: Array
+    place: Array
+    motion: Motion
+    count: Array  # periods settled  # pyright: ignore[reportIncompatibleMethodOverride]
+    due: Array  # periods after which the next search starts
+    latest: tuple[Array, Array]  # state after the settled periods
+    tangent: tuple[Array, Array]
+    growth: Array  # logarithm of the growth of the tangent
+    cost: Array  # largest number of steps of a settled period
+    spent: Array  # steps in all, of searches too
+    searching: Array
+    multiple: Array
+    corrections: Array
+    second: Array  # candidate to try if this period multiple fails
+    guess: tuple[Array, Array]
+    first: tuple[Array, Array]  # F^m of the initial state of the search
+    change: Array  # size of the last correction
+    approaching: Array
+    orbit: Orbit  # the orbit that the motion approaches
+    begun: Array  # periods settled when the approach began
+    held: Array  # successive recurrences that agree with the linearisation
+    probing: Array  # number of the point on the slow line under test, -1: none
+
+
+def select(condition: Array, new: Any, old: Any) -> Any:
+    """``new`` where the condition holds, else ``old``, for trees of arrays."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def candidates(lane: Lane, history: Array, omega: Array) -> tuple[Array, Array]:
+    """Two guesses at the period multiple, for a generous and for a narrow factor.
+
+    A guess is the smallest m whose recurrence is within this factor of the best one. Row ``n % 33`` of ``history``, shape
+    ``(33, 2 width)``, holds displacements and velocities after n periods.
+    """
+    u, v = lane.latest
+    distance = jnp.abs(history[:, : u.size] - u) + jnp.abs(history[:, u.size :] - v) / omega
+    age = (lane.count - _ROWS) % (MOST_PERIODS + 1)
+    distance = jnp.where((age > 0) & (age <= lane.count), distance, jnp.inf)
+    best = distance.min(axis=0)
+    floor = 1e-13 * (jnp.abs(u) + jnp.abs(v) / omega)
+
+    def smallest(factor: float) -> Array:
+        recurs = distance <= factor * best + floor
+        return jnp.where(recurs, age, MOST_PERIODS).min(axis=0).astype(jnp.int32)
+
+    first, second = smallest(_NEAR), smallest(_NARROW)
+    # Near an orbit whose period is about to double the motion alternates: twice the period recurs best, but Newton's method
+    # converges slowly for twice the period and fast for the period itself.
+    return first, jnp.where((second == first) & (first % 2 == 0), first // 2, second)
+
+
+def record(history: Array, now: Array, lane: Lane) -> Array:
+    """``history`` with the latest state in the lanes ``now``."""
+    row = jnp.where(now, lane.count % (MOST_PERIODS + 1), -1)
+    return jnp.where(jnp.concatenate([row, row]) == _ROWS, jnp.concatenate(lane.latest), history)
+
+
+def restart(lane: Lane, going: Array, u: Array, v: Array, periods: Array | int) -> Lane:
+    """Lanes ``going`` restart at the beginning of a period from ``(u, v)``."""
+    one, zero = jnp.ones_like(u), jnp.zeros_like(u)
+    count = jnp.zeros(u.shape, jnp.int32)
+    fresh = Motion(zero, one, zero, u, v, (one, zero, zero, one), jnp.broadcast_to(periods, u.shape) + count, count)
+    return lane._replace(motion=select(going, fresh, lane.motion))
+
+
+def settle(lane: Lane, now: Array, forget: int, omega: Array) -> Lane:
+    """The lanes after one more settled period in the lanes ``now``; at period ``forget`` the growth restarts from 0."""
+    motion = lane.motion
+    count = lane.count + 1
+    tangent = apply(motion.matrix, *lane.tangent)
+    size = jnp.abs(tangent[0]) + jnp.abs(tangent[1]) / omega
+    settled = lane._replace(
+        count=count,
+        latest=(motion.u, motion.v),
+        tangent=(tangent[0] / size, tangent[1] / size),
+        growth=jnp.where(count == forget, 0.0, lane.growth + jnp.log(size)),
+        cost=jnp.maximum(lane.cost, motion.steps),
+    )
+    return restart(select(now, settled, lane), now, motion.u, motion.v, 1)
+
+
+def search(lane: Lane, now: Array, multiple: Array, second: Array) -> Lane:
+    """Start Newton shooting from the latest state in the lanes ``now``, for this period multiple."""
+    begun = lane._replace(
+        searching=jnp.ones_like(now),
+        approaching=jnp.zeros_like(now),
+        held=jnp.zeros_like(lane.held),
+        multiple=multiple,
+        second=second,
+        corrections=jnp.zeros_like(lane.corrections),
+        guess=lane.latest,
+        change=jnp.full_like(lane.change, jnp.inf),
+    )
+    return restart(select(now, begun, lane), now, *lane.latest, multiple)
+
+
+def resume(lane: Lane, failed: Array) -> Lane:
+    """The lanes after failed searches: they try the second candidate if there is one, else continue settling."""
+    lane = lane._replace(probing=jnp.where(failed, -1, lane.probing))
+    again = failed & (lane.second != lane.multiple)
+    back = failed & ~again
+    due = jnp.where(back, lane.count + jnp.maximum(4, lane.count // 3), lane.due)
+    lane = restart(lane._replace(searching=lane.searching & ~back, due=due), back, *lane.latest, 1)
+    return search(lane, again, lane.second, lane.second)
+
+
+def approach(lane: Lane, now: Array, orbit: Orbit) -> Lane:
+    """The lanes after an orbit was found in the lanes ``now``: the motion continues from the latest state."""
+    begun = lane._replace(
+        searching=jnp.zeros_like(now),
+        approaching=jnp.ones_like(now),
+        orbit=orbit,
+        begun=lane.count,
+        due=lane.count + jnp.maximum(_PATIENCE * lane.multiple, lane.count // 3),
+    )
+    return restart(select(now, begun, lane), now, *lane.latest, 1)
+
+
+def confirm(lane: Lane, now: Array, history: Array, flank: Any, omega: Array) -> tuple[Lane, Array]:
+    """The lanes after a period in the lanes ``now``, and flags of lanes that have approached their orbit for long enough.
+
+    If the motion does not satisfy the linearisation about the orbit, counting restarts; a new search may follow.
+    """
+    due = now & lane.approaching & (lane.count > lane.begun) & ((lane.count - lane.begun) % lane.multiple == 0)
+    row = (lane.count - lane.multiple) % (MOST_PERIODS + 1)
+    past = jnp.where(jnp.concatenate([row, row]) == _ROWS, history, 0.0).sum(axis=0)
+    ok, arrived = linearisation_holds(lane.orbit, (past[: row.size], past[row.size :]), lane.latest, flank, omega)
+    held = jnp.where(due, jnp.where(ok, lane.held + 1, 0), lane.held)
+    return lane._replace(held=held), due & ok & (arrived | (held >= recurrences(lane.orbit)))
+
+
+def try_line(lane: Lane, now: Array, orbit: Orbit, omega: Array) -> tuple[Lane, Array, Array]:
+    """The lanes with the next point on the slow line, flags of success and flags of failure.
+
+    Lanes ``now`` have found an orbit that they approach slowly, or have run from a point on the line. A lane succeeds if
+    all its points approached the orbit, and fails at the first point that did not.
+    """
+    begins = now & (lane.probing < 0)
+    twice, negative = doubled(orbit)
+    negative &= lane.multiple <= MOST_PERIODS // 2
+    multiple = jnp.where(begins & negative, 2 * lane.multiple, lane.multiple)
+    lane = lane._replace(orbit=select(begins, select(negative, twice, orbit), lane.orbit), multiple=multiple)
+    place, _ = probe(lane.orbit, lane.latest, lane.probing)
+    good = is_attracted(lane.orbit, lane.latest, place, (lane.motion.u, lane.motion.v), omega)
+    number = lane.probing + now.astype(jnp.int32)
+    failed = now & ~begins & ~good
+    through = now & ~begins & good & (number >= PROBES)
+    _, start = probe(lane.orbit, lane.latest, number)
+    # After a failure there is no other candidate.
+    lane = lane._replace(probing=number, second=jnp.where(failed, lane.multiple, lane.second))
+    lane = restart(lane, now & ~failed & ~through, *start, lane.multiple)
+    return lane, through, failed
+
+
+def enter(lane: Lane, now: Array, job: Array, place: Array, u: Array, v: Array, hint: Array) -> Lane:
+    """Lanes ``now`` enter a new point from ``(u, v)`` and search at once for an orbit of ``hint`` periods."""
+    zero = jnp.zeros_like(u)
+    fresh = lane._replace(
+        job=job,
+        place=place,
+        count=jnp.zeros_like(lane.count),
+        due=jnp.full_like(lane.due, 4),
+        probing=jnp.full_like(lane.probing, -1),
+        latest=(u, v),
+        tangent=(zero + 0.6, zero + 0.8),
+        growth=zero,
+        cost=jnp.zeros_like(lane.count),
+        spent=zero,
+    )
+    return search(select(now, fresh, lane), now, hint, hint)
+
+
+def blank(width: int) -> Lane:
+    """Lanes without a point."""
+    real, whole = jnp.zeros(width), jnp.zeros(width, jnp.int32)
+    pair, flag = (real, real), jnp.zeros(width, bool)
+    motion = Motion(real, real + 1, real, real, real, (real + 1, real, real, real + 1), whole, whole)
+    return Lane(
+        job=whole,
+        place=whole,
+        motion=motion,
+        count=whole,
+        due=whole,
+        latest=pair,
+        tangent=pair,
+        growth=real,
+        cost=whole,
+        spent=real,
+        searching=flag,
+        multiple=whole + 1,
+        corrections=whole,
+        second=whole,
+        guess=pair,
+        first=pair,
+        change=real,
+        approaching=flag,
+        orbit=Orbit(real, real, (real, real, real, real), real, real),
+        begun=whole,
+        held=whole,
+        probing=whole - 1,
+    )
+
 
 # Newton: most corrections, relative size of the last correction, and size below which corrections may stall by rounding.
 _CORRECTIONS, _CONVERGED, _ROUNDING = 12, 1e-11, 1e-7

@@ -17,7 +17,6 @@ from jax import Array
 
 from drivetrain_jax.analysis._base import Outcome
 from drivetrain_jax.analysis.impacts.attractor import Attractors, attractors, averaged, take
-from drivetrain_jax.analysis.impacts.attractor_lanes import MOST_PERIODS
 from drivetrain_jax.analysis.impacts.motion import (
     ABSENT,
     REGIMES,
@@ -31,8 +30,15 @@ from drivetrain_jax.analysis.impacts.motion import (
 )
 from drivetrain_jax.analysis.impacts.orbit_measures import Measures, measure
 from drivetrain_jax.analysis.impacts.piecewise_march import march, prepare, start
-from drivetrain_jax.analysis.numerics.branch_sections import course, distinct, sections
-from drivetrain_jax.analysis.numerics.continuation import Mapped, PeriodMap, folds_and_doublings, follow
+from drivetrain_jax.analysis.numerics.continuation import (
+    Mapped,
+    PeriodMap,
+    course,
+    distinct,
+    folds_and_doublings,
+    follow,
+    sections,
+)
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 NON_PERIODIC = REGIMES.index("non_periodic")
@@ -174,9 +180,6 @@ def sweeps(
 def worst(outcome: Array) -> Array:
     """The worse outcome of both directions, ``(L, 2, ...) -> (L, ...)``."""
     return jnp.max(outcome, axis=1)
-
-
-__all__ = ["INTEGRALS", "MOST_PERIODS", "NON_PERIODIC", "WIDTH", "describe", "points_of", "sweeps", "worst"]
 
 
 # All orbits of the drive's period on the branch of a sweep, stable or not, with the folds and period doublings.

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.impacts.attractor import take
-from drivetrain_jax.analysis.impacts.attractor_lanes import MOST_PERIODS
+from drivetrain_jax.analysis.impacts.attractor import MOST_PERIODS, take
 from drivetrain_jax.analysis.impacts.piecewise_march import (
     Bound,
     Derivatives,
