@@ -25,7 +25,6 @@ _MODES = Parameter("modes", "1", "number of modes", default=5, lower=1, upper=10
 def _solve(
     name: str, system: type[System], request: Request, values: Mapping[str, Any], effort: Array
 ) -> dict[str, Array]:
-    del effort
     model = system.models[name]
     own = {v.name for v in model.results if v.dims}
     constants, with_modes = model.build(values), {v.name for v in model.results if v.dims == (MODE,)}

@@ -22,7 +22,7 @@ from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.scene import Problem, Scene, restore_scene, result_variables
 from drivetrain_jax.store import zarr_store
-from drivetrain_jax.store.consolidate import CONVENTIONS, Coordinate, Labelled, ResultFile, release
+from drivetrain_jax.store.consolidate import CONVENTIONS, Entry, Labelled, ResultFile, release
 from drivetrain_jax.store.files import command, flush_tree, move_folder, now, versions
 from drivetrain_jax.store.parts import PartsFolder
 from drivetrain_jax.systems import System
@@ -184,23 +184,20 @@ def to_dataset(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[st
     return labelled(scene, arrays, attrs).to_dataset()
 
 
-def axis_coordinates(scene: Scene) -> list[Coordinate]:
-    """The axes as the scene gives them, and the parameters that vary along them."""
-    coordinates = [
-        Coordinate(
-            part.own_dim,
-            ("point",) if scene.zipped else (axis.dim,),
-            part.values,
-            part.parameter.units,
-            part.long_name,
-            "" if part.name == part.own_dim else part.name,
-        )
-        for axis in scene.axes
-        for part in (*axis.given, *axis.together)
-    ]
+def axis_coordinates(scene: Scene) -> dict[str, Entry]:
+    """The axes as the scene gives them, and the parameters that vary along them.
+
+    The attribute ``parameter`` is the key of a parameter in the scene if it differs from the name.
+    """
+    coordinates = {}
     if scene.zipped:
-        numbers = np.arange(len(scene.axes[0].values))
-        coordinates.insert(0, Coordinate("point", ("point",), numbers, "1", "position of the point in the lists"))
+        about = {"units": "1", "long_name": "position of the point in the lists"}
+        coordinates["point"] = Entry(("point",), np.arange(len(scene.axes[0].values)), about)
+    for axis in scene.axes:
+        for part in (*axis.given, *axis.together):
+            named = {} if part.name == part.own_dim else {"parameter": part.name}
+            about = {"units": part.parameter.units, "long_name": part.long_name, **named}
+            coordinates[part.own_dim] = Entry(("point",) if scene.zipped else (axis.dim,), part.values, about)
     return coordinates
 
 

@@ -219,7 +219,6 @@ def _kind(
         return values
 
     def solve(values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
-        del effort
         found = one.call({key: values[key] for key in varies})
         results = {v.name: found[v.name].astype(v.dtype) for v in variables}
         return _with_outcome(results, found.get(OUTCOME.name))

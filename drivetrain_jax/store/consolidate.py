@@ -32,21 +32,6 @@ DETAILS, GROUP = frozenset({"numerics_detail"}), "provenance"
 
 
 @dataclass(frozen=True)
-class Coordinate:
-    """Values of a parameter or prediction along dimensions of the result.
-
-    ``parameter`` is the key of the parameter in the scene if it differs from ``name``.
-    """
-
-    name: str
-    dims: tuple[str, ...]
-    values: np.ndarray
-    units: str
-    long_name: str
-    parameter: str = ""
-
-
-@dataclass(frozen=True)
 class Entry:
     """One variable of a result. ``fill`` is the value for missing data."""
 
@@ -71,7 +56,7 @@ class Labelled:
     def build(
         cls,
         sweep_dims: Sequence[str],
-        coordinates: Iterable[Coordinate],
+        coordinates: Mapping[str, Entry],
         dimensions: Iterable[Dimension],
         results: Iterable[tuple[Variable, np.ndarray]],
         attrs: Mapping[str, str | float],
@@ -82,11 +67,7 @@ class Labelled:
         (``coordinates``) and for the ``dimensions`` that a result uses; each has ``units`` and ``long_name``. A dimension
         without values is numbered from 1.
         """
-        results = list(results)
-        coords = {}
-        for c in coordinates:
-            named = {"parameter": c.parameter} if c.parameter else {}
-            coords[c.name] = Entry(c.dims, c.values, {"units": c.units, "long_name": c.long_name, **named})
+        results, coords = list(results), dict(coordinates)
         sizes = {d: n for v, values in results for d, n in zip(reversed(v.dims), reversed(values.shape), strict=False)}
         for d in dimensions:
             if d.name in sizes:

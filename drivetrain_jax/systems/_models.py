@@ -260,7 +260,6 @@ class LinearPeriodic(eqx.Module):
 
     def vf(self, t: Any, y: Any, args: Any) -> Array:
         """``A(t) y`` of a state or a matrix of states ``y``."""
-        del args
         # Written as sums: under vmap small matrix products are slower.
         rows = self.square_rows(*self.basis(t))
         return jnp.stack([sum(a * y[j] for j, a in enumerate(row) if not _vanishes(a)) + 0 * y[0] for row in rows])

@@ -110,7 +110,6 @@ def _traced_half_turns(speeds: Sequence[Any], bent: Sequence[Any]) -> Array:
 @jax.custom_jvp
 def _without_derivative(x: Any, where: Any) -> Any:
     """``x``, whose derivative is NaN ``where`` the period depends on it."""
-    del where
     return x
 
 

@@ -534,7 +534,6 @@ class Planetary(System):
 
         Errors and torques are left out: their frequency belongs to ``harmonic_response`` and not to the gear.
         """
-        del t
         springs, (q, rate) = self.springs(), jnp.split(jnp.asarray(y), 2)
         pulls = springs.stiffness * jnp.sum(springs.extensions * q, axis=1)
         forces = jnp.sum(springs.extensions * pulls[:, None], axis=0)

@@ -10,13 +10,13 @@ import xarray as xr
 from drivetrain_jax import InputError
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.store import checksums
-from drivetrain_jax.store.consolidate import Coordinate, Labelled, open_result, write_result
+from drivetrain_jax.store.consolidate import Entry, Labelled, open_result, write_result
 from tests.sizes import full_after
 
 
 @pytest.fixture
 def path(tmp_path):
-    axis = Coordinate("x", ("x",), np.linspace(0, 1, 40), "m", "place")
+    axis = Entry(("x",), np.linspace(0, 1, 40), {"units": "m", "long_name": "place"})
     rng = np.random.default_rng(1)
     results = [
         (Variable("z", "1", "complex", ("k",), "complex128"), rng.random((40, 2)) + 1j),
@@ -26,7 +26,7 @@ def path(tmp_path):
     attrs = {"title": "one", "analysis": "toy", "numerics_detail": "long"} | {
         f"attribute_{i}": "some" for i in range(9)
     }
-    result = Labelled.build(("x",), [axis], (Dimension("k", "number", ("up", "down")),), results, attrs)
+    result = Labelled.build(("x",), {"x": axis}, (Dimension("k", "number", ("up", "down")),), results, attrs)
     write_result(result, tmp_path / "r.nc", tmp_path / "tmp")
     return tmp_path / "r.nc"
 

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 from drivetrain_jax._quantities import Dimension, Variable
-from drivetrain_jax.store.consolidate import Coordinate, Labelled, write_result
+from drivetrain_jax.store.consolidate import Entry, Labelled, write_result
 
 OWN = {"_NCProperties", "checksums"}
 
@@ -17,8 +17,8 @@ OWN = {"_NCProperties", "checksums"}
 @pytest.fixture
 def result():
     """A result with and without coordinates, an empty dimension, texts, codes, complex numbers, an auxiliary coordinate."""
-    x = Coordinate("x", ("x",), np.array([1.0, 2.0]), "m", "place")
-    time = Coordinate("t0", ("x",), np.array([0.0, 5.0]), "s", "instant")
+    x = Entry(("x",), np.array([1.0, 2.0]), {"units": "m", "long_name": "place"})
+    time = Entry(("x",), np.array([0.0, 5.0]), {"units": "s", "long_name": "instant"})
     results = [
         (Variable("z", "1", "complex", ("k",), "complex128"), np.array([[1 + 2j, np.nan], [0, -1j]])),
         (Variable("e", "s", "empty", ("none",)), np.empty((2, 0))),
@@ -27,7 +27,7 @@ def result():
     ]
     dims = (Dimension("k", "name", ("up", "é")), Dimension("number", "number", (), "s"))
     attrs = {"digest": "abc", "scene": "é = 1\n" * 30_000, "wall_time_s": 1.5, "solves": 3, "none": ""}
-    return Labelled.build(("x",), [x, time], dims, results, attrs)
+    return Labelled.build(("x",), {"x": x, "t0": time}, dims, results, attrs)
 
 
 @pytest.fixture
@@ -93,7 +93,7 @@ def test_netcdf4_reads_what_was_written(result, path):
 
 def test_a_scalar_without_any_dimension(tmp_path):
     scalars = [(Variable("f", "s", "time"), np.array(np.pi)), (Variable("z", "1", "c", (), "complex128"), np.array(2j))]
-    write_result(Labelled.build((), [], (), scalars, {"digest": "abc"}), tmp_path / "r.nc", tmp_path / "tmp")
+    write_result(Labelled.build((), {}, (), scalars, {"digest": "abc"}), tmp_path / "r.nc", tmp_path / "tmp")
     with xr.open_dataset(tmp_path / "r.nc", engine="h5netcdf") as again:
         assert (again["f"].item(), again["z"].item(), dict(again.sizes)) == (np.pi, 2j, {})
 
@@ -108,6 +108,6 @@ def test_data_are_contiguous_and_allocated(result, path):
 
 def test_lengths_that_disagree_are_refused():
     results = [(Variable("f", "s", "time", ("k",)), np.ones(3))]
-    labelled = Labelled.build((), [], (Dimension("k", "name", ("up", "down")),), results, {})
+    labelled = Labelled.build((), {}, (Dimension("k", "name", ("up", "down")),), results, {})
     with pytest.raises(ValueError, match="f: length 3 along 'k', which has length 2"):
         _ = labelled.sizes

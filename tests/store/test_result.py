@@ -17,7 +17,7 @@ from drivetrain_jax._machine import machine, physical_memory, usable_cores
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.store import files
 from drivetrain_jax.store.consolidate import (
-    Coordinate,
+    Entry,
     Labelled,
     ResultFile,
     open_result,
@@ -29,8 +29,8 @@ from drivetrain_jax.store.consolidate import (
 
 @pytest.fixture
 def result():
-    x = Coordinate("x", ("x",), np.array([1.0, 2.0]), "m", "place")
-    time = Coordinate("t0", ("x",), np.array([0.0, 5.0]), "s", "instant")
+    x = Entry(("x",), np.array([1.0, 2.0]), {"units": "m", "long_name": "place"})
+    time = Entry(("x",), np.array([0.0, 5.0]), {"units": "s", "long_name": "instant"})
     results = [
         (Variable("z", "1", "complex", ("k",), "complex128"), np.array([[1 + 2j, np.nan], [0, -1j]])),
         (Variable("f", "s", "duration"), np.array([np.nan, 3.0])),
@@ -38,7 +38,7 @@ def result():
     ]
     dims = (Dimension("k", "number", ("up", "down")), Dimension("unused", "never", (1, 2)))
     return Labelled.build(
-        ("x",), [x, time], dims, results, {"digest": "abc", "scene": "é = 1\n" * 30_000, "wall_time_s": 1.5}
+        ("x",), {"x": x, "t0": time}, dims, results, {"digest": "abc", "scene": "é = 1\n" * 30_000, "wall_time_s": 1.5}
     )
 
 
@@ -86,9 +86,9 @@ def test_two_files_of_one_result_are_identical(result, tmp_path):
 
 
 def test_a_variable_without_entries(tmp_path):
-    axis = Coordinate("x", ("x",), np.array([1.0, 2.0]), "m", "place")
+    axis = Entry(("x",), np.array([1.0, 2.0]), {"units": "m", "long_name": "place"})
     results = [(Variable("z", "1", "nothing", ("k",)), np.empty((2, 0))), (Variable("f", "s", "time"), np.ones(2))]
-    result = Labelled.build(("x",), [axis], (), results, {"digest": "abc"})
+    result = Labelled.build(("x",), {"x": axis}, (), results, {"digest": "abc"})
     write_result(result, tmp_path / "r.nc", tmp_path / "tmp")
     with xr.open_dataset(tmp_path / "r.nc", engine="h5netcdf") as again:
         assert again["z"].shape == (2, 0) and again["f"].values.tolist() == [1.0, 1.0]
@@ -103,7 +103,7 @@ def resident():
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory is looked up in /proc")
 def test_released_pages_take_no_memory_and_are_not_lost(tmp_path):
     blank = np.broadcast_to(np.zeros(()), (1 << 22,))
-    template = Labelled.build(("x",), [], [], [(Variable("f", "s", "duration"), blank)], {"digest": "abc"})
+    template = Labelled.build(("x",), {}, [], [(Variable("f", "s", "duration"), blank)], {"digest": "abc"})
     with ResultFile(tmp_path / "tmp") as file:
         arrays = file.lay_out(template)
         arrays["f"][:] = 3.0

@@ -59,7 +59,6 @@ def _solve(
     build: Callable[..., PiecewiseLinearOscillator], request: Request, values: Mapping[str, Any], effort: Array
 ) -> dict[str, Array]:
     """The requested results of a batch of points, the batch as last axis; ``effort`` is not used."""
-    del effort
     model, options = build(values), request.options
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in vars(model).values()))
     points, samples = int(np.prod(shape, dtype=int)), options["samples"]

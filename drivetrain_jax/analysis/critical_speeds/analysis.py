@@ -158,7 +158,6 @@ def _shapes(shaft: Shaft, roots: Roots, stations: int) -> Array:
 
 def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """All requested results; for arrays of lanes the lanes are the last axis."""
-    del effort
     shaft, options = build(values), request.options
     certified = request.method == "certified"
     roots = (shaft_roots.find_roots if certified else shaft_roots.krylov_roots)(shaft, options["modes"])

@@ -139,7 +139,6 @@ def _derivatives(
 
     ``results`` are not used, so a gradient alone computes no values.
     """
-    del results
     from drivetrain_jax.analysis.floquet.derivatives import monodromy, multipliers, shares_modulus
 
     build = system.models["floquet"].build

@@ -140,7 +140,6 @@ def adaptive_steps(system: type[System], request: Request) -> tuple[Solver, ...]
     needs_error, as_published = bool(NEED_ERROR & set(request.outputs)), request.options["form"] == "published"
 
     def solve(values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
-        del effort
         build = system.models["floquet"].build
         model = build(values)
         form = model.natural if as_published else model.reduced

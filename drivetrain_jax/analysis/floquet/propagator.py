@@ -168,7 +168,6 @@ class LinearTerm(diffrax.AbstractTerm):
 
     def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
         """The time between ``t0`` and ``t1``."""
-        del kwargs
         return t1 - t0
 
     def prod(self, vf: Any, control: Any) -> Any:
@@ -218,7 +217,6 @@ class Gauss(diffrax.AbstractSolver):
         self, terms: LinearTerm, t0: Any, t1: Any, y0: Array, args: Any, solver_state: Monodromy, made_jump: Any
     ) -> tuple[Array, None, dict[str, Array], Monodromy, diffrax.RESULTS]:
         """The state at the end of the span."""
-        del t0, t1, args, solver_state, made_jump
         system = terms.system if isinstance(terms, LinearTerm) else terms.term.system
         propagator, monodromy = self.solved(system)
         y1 = matmul(propagator, y0.reshape(len(y0), -1)).reshape(y0.shape)
@@ -383,7 +381,6 @@ def _factors_of_block(
     panels: Array,
 ) -> Factored:
     """By simultaneous iteration over several periods: subspaces of separate moduli are those of the last period."""
-    del determinant
     n = marches[0].size
     unit = jnp.broadcast_to(jnp.eye(n)[..., None], (n, n, lanes))
     # No subspace of a decoupled system may be missing from the first vectors.

@@ -423,7 +423,6 @@ def _solve(
     build: Build, n: int, speed: str, request: Request, values: Mapping[str, Any], effort: Array
 ) -> dict[str, Array]:
     """All requested results of one point; ``effort`` only orders the batches, as every integration is adaptive."""
-    del effort
     model, rtol = build(values), request.options["rtol"]
     n = model.size or n
     response = linear_response(model, n, rtol, not PEAKS.isdisjoint(request.outputs))

@@ -117,7 +117,6 @@ _CHUNK = 50
 
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     """Directions, branches and folds; ``InputError`` for a result that the method does not provide, or too few samples."""
-    del system
     for name in request.outputs:
         if request.method not in _ONLY.get(name, (request.method,)):
             methods = ", ".join(_ONLY[name])
@@ -153,7 +152,6 @@ def _solve(
     build: Callable[..., PiecewiseLinearOscillator], request: Request, values: Mapping[str, Any], effort: Array
 ) -> dict[str, Array]:
     """A line; ``effort`` only orders the batches."""
-    del effort
     model, unit = to_scaled_length(build(values))
     model.check_method(model.damps_play, request.method)
     options, shape = request.options, _shape(model)

@@ -49,7 +49,6 @@ def variables(system: type[System]) -> tuple[Variable, ...]:
 
 def dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     """Orbits, displacements, folds and doublings."""
-    del request, fixed
     assert system.displacements is not None
     numbers = tuple(range(1, _SPECIAL + 1))
     return (
@@ -68,7 +67,6 @@ def solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
 
 def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """The requested results of one line; ``effort`` only orders the batches."""
-    del effort
     speed, n = system.role("speed"), len(system.state)
     rising, place = np.unique(np.asarray(values[speed]), return_inverse=True)
 

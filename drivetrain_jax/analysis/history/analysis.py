@@ -42,7 +42,6 @@ from drivetrain_jax.systems import Flow, PiecewiseLinearOscillator, System
 
 def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """All requested results of one point; ``effort`` only orders the batches, as the integration is adaptive."""
-    del effort
     flow: Flow = system.models["history"].build(values)
     found = integrated(flow, request)
     states, error = found.states, found.error

@@ -51,7 +51,6 @@ class WatchedSteps(diffrax.AbstractAdaptiveStepSizeController[_State, None]):
 
     def wrap(self, direction: Any) -> WatchedSteps:
         """Itself: the steps go forwards."""
-        del direction
         return self
 
     def init(

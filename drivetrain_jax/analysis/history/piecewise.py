@@ -168,7 +168,6 @@ def variables(system: type[System]) -> tuple[Variable, ...]:
 
 def dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     """Dimensions of times and events; raises ``InputError`` for a result that the method does not compute."""
-    del system
     PiecewiseLinearOscillator.check_method(fixed.get("damping") != "contact", request.method)
     for variable in _AVERAGED if request.method == "exact" else _EXACT:
         if variable.name in request.outputs:
@@ -214,7 +213,6 @@ def _period(build: Any, values: Mapping[str, Any]) -> Array:
 
 def _exact(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """The requested results of a batch, lanes last; ``effort`` only orders the batches."""
-    del effort
     times = np.array(requested_times(request))
     model: PiecewiseLinearOscillator = system.models["history"].build(values)
     given = [values[system.role(role)] for role in _STARTS]
@@ -254,7 +252,6 @@ def averaged_flow(
 
 def _averaged(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """The requested results of one point."""
-    del effort
     model: PiecewiseLinearOscillator = system.models["history"].build(values)
     model.check_method(model.damps_play, request.method)
     u0, v0 = (jnp.asarray(values[system.role(role)], float) for role in _STARTS)

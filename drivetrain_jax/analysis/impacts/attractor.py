@@ -450,11 +450,6 @@ def _speed(local: PiecewiseLinearOscillator, u: Array, v: Array) -> Array:
     return jnp.abs(v) + jnp.sqrt(local.stiffness) * jnp.maximum(jnp.abs(u) - local.b, 0.0)
 
 
-def _usual_speed(local: PiecewiseLinearOscillator) -> Array:
-    drive = jnp.abs(local.B0) + jnp.abs(local.B1)
-    return local.omega * local.b + drive * (1 / local.omega + 1 / jnp.sqrt(local.stiffness))
-
-
 def _shoot(
     lane: Lane, now: Array, local: PiecewiseLinearOscillator, lanes: Lanes, omega: Array
 ) -> tuple[Lane, _Verdict]:
@@ -468,7 +463,9 @@ def _shoot(
     size = reach(*guess, local.b, omega)
     stuck = (change <= _ROUNDING * size + 64 * _EPS * jnp.abs(guess[0])) & (change > lane.change / 2)
     converged = (change <= _CONVERGED * size) | stuck
-    astray = ~(_speed(local, *guess) <= _ASTRAY * (_speed(local, *lane.latest) + _usual_speed(local)))
+    drive = jnp.abs(local.B0) + jnp.abs(local.B1)
+    usual = local.omega * local.b + drive * (1 / local.omega + 1 / jnp.sqrt(local.stiffness))
+    astray = ~(_speed(local, *guess) <= _ASTRAY * (_speed(local, *lane.latest) + usual))
     going = now & ~converged & (lane.corrections < _CORRECTIONS) & ~astray & (change <= _SHRINKING * lane.change)
     contraction = log_determinant(local, motion.matrix, lane.multiple * 2 * np.pi / omega)
     # At the limit of rounding, what is left may be as large as the last change and more.

@@ -80,7 +80,9 @@ def describe(
     periodic = found.multiple > 0
     wild = ~periodic & (found.exponent * averaged(found.periods) * oscillator.period > _WILD)
     size = jnp.maximum(jnp.abs(seen.high), jnp.abs(seen.low))
-    exact = (found.error <= rtol * size) & (found.error <= _DECIDES * _away(oscillator, seen))
+    # Not the size of u: at a wide backlash the motion about a flank is far from the origin.
+    away = jnp.maximum(*(jnp.abs(jnp.abs(u) - oscillator.b) for u in (seen.high, seen.low)))
+    exact = (found.error <= rtol * size) & (found.error <= _DECIDES * away)
     outcome = jnp.where(periodic & ~exact, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
     results = periodic_results(oscillator, seen)
     unstable = periodic & (results["spectral_radius"] > 1 + _UNSTABLE)
@@ -101,12 +103,6 @@ def describe(
         "periods_settled": found.periods,
         "outcome": outcome.astype(jnp.int8),
     }
-
-
-def _away(oscillator: PiecewiseLinearOscillator, seen: Measures) -> Array:
-    """Largest distance from the flanks: far from the origin, at a wide backlash, it is much smaller than u."""
-    high, low = (jnp.abs(jnp.abs(u) - oscillator.b) for u in (seen.high, seen.low))
-    return jnp.maximum(high, low)
 
 
 def periodic_results(oscillator: PiecewiseLinearOscillator, seen: Measures) -> dict[str, Array]:
@@ -139,11 +135,8 @@ def periodic_results(oscillator: PiecewiseLinearOscillator, seen: Measures) -> d
 
 def points_of(model: PiecewiseLinearOscillator, length: int, lanes: int) -> PiecewiseLinearOscillator:
     """The oscillators of all points, frequencies first: fields of shape ``(length * lanes,)``, or scalars."""
-    omega = jnp.broadcast_to(jnp.asarray(model.omega).reshape(-1, 1), (length, lanes)).reshape(-1)
-    names = ("damping", "stiffness", "alpha", "b", "B0", "B1", "unbalance")
-    own = {name: getattr(model, name) for name in names}
-    tiled = {name: jnp.tile(value, length) for name, value in own.items() if jnp.ndim(value)}
-    return replace(model, **tiled).at(omega)
+    tiled = {name: jnp.tile(x, length) for name, x in vars(model).items() if name != "omega" and jnp.ndim(x)}
+    return replace(model, **tiled).at(jnp.repeat(jnp.asarray(model.omega), lanes))
 
 
 def sweeps(
@@ -251,13 +244,14 @@ def branch(
     lanes = first.shape[1]
     number = np.broadcast_to(np.arange(omega.size)[:, None, None] * lanes, exists.shape)
     index = jnp.asarray((number + np.tile(np.arange(lanes), 2)).reshape(-1))
-    points = _points(model, omega, lanes)
+    points = points_of(replace(model, omega=omega), omega.size, lanes)
     states = jnp.moveaxis(guess, 2, 0).reshape(3, -1)[:2]
     results = _described(take(points, index), states, exists.reshape(-1), width)
     exists = exists.reshape(omega.size, 2 * BRANCHES, lanes)
     results, all_told = _ordered({name: x.reshape(exists.shape) for name, x in results.items()}, exists)
     complete = all_told & every.reshape(-1, 2, lanes).all(axis=1)
-    complete &= _ended(found.x[:, 2], limits).reshape(2, lanes).all(axis=0)
+    ended = jnp.any((found.x[:, 2] > limits[1]) | (found.x[:, 2] < limits[0]), axis=0)
+    complete &= ended.reshape(2, lanes).all(axis=0)
     complete &= (found.x[:, 2] >= high).any(axis=0).reshape(2, lanes).any(axis=0)
     if special:
         every_map = lambda index: _period_map(take(both, index))  # noqa: E731
@@ -266,17 +260,6 @@ def branch(
             results[name] = jnp.broadcast_to(x, (omega.size, *x.shape))
         complete &= all_found
     return results, complete
-
-
-def _ended(omega: Array, limits: tuple[float, float]) -> Array:
-    """True if the branch has left the limits."""
-    return jnp.any((omega > limits[1]) | (omega < limits[0]), axis=0)
-
-
-def _points(model: PiecewiseLinearOscillator, omega: np.ndarray, lanes: int) -> PiecewiseLinearOscillator:
-    """The oscillators of all points, frequencies first."""
-    own = {k: jnp.tile(v, omega.size) for k, v in vars(model).items() if k != "omega" and jnp.ndim(v)}
-    return replace(model, **own).at(jnp.asarray(np.repeat(omega, lanes)))
 
 
 def _ordered(results: dict[str, Array], exists: Array) -> tuple[dict[str, Array], Array]:

@@ -383,7 +383,6 @@ def findings_of(run: Run, period: Any) -> Findings:
 
 def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """All requested results of a batch, its axis last; ``effort`` only orders the batches."""
-    del effort
     return analyse(system.models["lyapunov"].build(values), request)
 
 

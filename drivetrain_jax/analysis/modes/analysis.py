@@ -415,7 +415,6 @@ def _frequencies(frequency: Array, found: Array, participation: Array | None) ->
 
 def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """All requested results, lanes last; with a track, its points first."""
-    del effort
     track, lanes = request.options["track"], lane_count(values, request.options["track"])
     wanted = (*request.outputs, "outcome")
     if not track:
@@ -486,7 +485,6 @@ def _derivatives(
     splits equal frequencies (along the eigenvalues of ``u_i^T (dK - (2 pi f)^2 dM) u_j``), and where the frequency of a
     rigid mode rises from zero like sqrt(k).
     """
-    del request, results
 
     def model(parameters: Any) -> SpringSystem:
         return system.models["modes"].build(eqx.combine(parameters, constants.tree))

@@ -286,7 +286,6 @@ def _angle(flow: Flow, strobes: Array) -> Array | None:
 
 def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """All requested results, the batch (if any) as last axis; ``effort`` only orders the batches."""
-    del effort
     flow: Flow = system.models["poincare"].build(values)
     section = adaptive_section if request.method == "adaptive" else fixed_section
     states, early, outcome = section(flow, request)

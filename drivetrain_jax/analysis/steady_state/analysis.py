@@ -157,7 +157,6 @@ def _solve(
     system: type[System], request: Request, underdamped: bool, values: Mapping[str, Any], effort: Array
 ) -> dict[str, Array]:
     """The requested results of a batch of points, the batch as last axis; ``effort`` is not used."""
-    del effort
     model: PiecewiseLinearOscillator = system.models["steady_state"].build(values)
     model = UnderdampedOscillator(**vars(model)) if underdamped else model
     start = [values[system.role(role)] for role in _STARTS]
