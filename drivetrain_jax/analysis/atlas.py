@@ -81,9 +81,7 @@ SOLVES = Analysis(
     variables=_SOLVED,
     default_outputs=(PROPAGATOR, CHANGE),
     methods={"direct": ("rtol",)},
-    method_titles={
-        "direct": "direct solves of floquet at the nodes of Chebyshev panels",
-    },
+    method_titles={"direct": "direct solves of floquet at the nodes of Chebyshev panels"},
     options=(RTOL,),
     solvers=_propagator_solvers,
     dimensions=_dimensions,

@@ -212,12 +212,6 @@ def _drawn(system: type[System]) -> dict[str, Any]:
     return shown | ({"periods_per_turn": system.periods_per_turn} if system.periods_per_turn else {})
 
 
-def _roles(scene: Scene) -> dict[str, str]:
-    """The roles of the system; an axis given in physical data takes the role of its parameter."""
-    given = {axis.name: axis.dim for axis in scene.axes if axis.given}
-    return {role: given.get(name, name) for role, name in scene.system.roles.items()}
-
-
 def _physical(scene: Scene) -> dict[str, str]:
     """The physical data of a scene that do not vary."""
     if not scene.data or scene.system.physical is None:
@@ -238,11 +232,10 @@ def result_attrs(scene: Scene) -> dict[str, str]:
     for name, value in scene.fixed.items():
         parameter = scene.system.parameter(name)
         fixed[name] = {"value": _finite(value), "units": parameter.units, "long_name": parameter.long_name}
-    installed, created, version = (
-        versions((*PACKAGES, *_STORAGE)),
-        now(),
-        drivetrain_jax.__version__,
-    )
+    # An axis given in physical data takes the role of its parameter.
+    given = {axis.name: axis.dim for axis in scene.axes if axis.given}
+    roles = {role: given.get(name, name) for role, name in scene.system.roles.items()}
+    installed, created, version = versions((*PACKAGES, *_STORAGE)), now(), drivetrain_jax.__version__
     cited = {"references": scene.system.source} if scene.system.source else {}
     return {
         "Conventions": CONVENTIONS,
@@ -251,7 +244,7 @@ def result_attrs(scene: Scene) -> dict[str, str]:
         "history": f"{created}: {command()}",
         **cited,
         "system": scene.system.name,
-        "roles": json.dumps(_roles(scene)),
+        "roles": json.dumps(roles),
         **_drawn(scene.system),
         "analysis": scene.analysis.name,
         "method": scene.request.method,

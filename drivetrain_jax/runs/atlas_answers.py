@@ -310,10 +310,7 @@ def _result_rows(atlas: StoredAtlas, results: Mapping[str, Any], variables: Mapp
 
 
 def least_damping(
-    atlas: StoredAtlas,
-    given: Mapping[str, float | Range],
-    amplitude: Any = None,
-    show: Show | None = None,
+    atlas: StoredAtlas, given: Mapping[str, float | Range], amplitude: Any = None, show: Show | None = None
 ) -> Reply:
     """The least damping above which a range of speeds is stable.
 
@@ -325,10 +322,7 @@ def least_damping(
 
 
 def widest_angle(
-    atlas: StoredAtlas,
-    given: Mapping[str, float | Range],
-    amplitude: Any = None,
-    show: Show | None = None,
+    atlas: StoredAtlas, given: Mapping[str, float | Range], amplitude: Any = None, show: Show | None = None
 ) -> Reply:
     """The widest joint angle below which a range of speeds is stable.
 
@@ -353,11 +347,7 @@ def _limit(
 
 
 def speed_windows(
-    atlas: StoredAtlas,
-    given: Mapping[str, float],
-    margin: float = 0.0,
-    amplitude: Any = None,
-    show: Show | None = None,
+    atlas: StoredAtlas, given: Mapping[str, float], margin: float = 0.0, amplitude: Any = None, show: Show | None = None
 ) -> Reply:
     """The stable ranges of speed, shortened by ``margin`` times the speed at either end, within a range of speeds if one is
     given. Raises as :func:`query`."""

@@ -66,10 +66,7 @@ def _analysis_lines(name: str, system: type[System]) -> list[str]:
     lines += aligned(
         [_variable_row(v, v.name in analysis.default_outputs) for v in analysis.variables if v.name not in lacking]
     )
-    lines += [
-        "  (* default of outputs)",
-        "  Methods and their options, the default first",
-    ]
+    lines += ["  (* default of outputs)", "  Methods and their options, the default first"]
     methods = [
         (method, analysis.method_titles.get(method, ""), ", ".join(used))
         for method, used in analysis.methods.items()

@@ -178,7 +178,7 @@ def _function_scene(
     content = [re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr)), *(np.asarray(x).tobytes() for x in traced.consts)]
     computes = hashlib.blake2b(repr(content).encode(), digest_size=16).hexdigest()
     words = {variable.name: variable for variable in results}
-    variables = tuple(_variable(key, shapes[key], words.get(key)) for key in wanted)
+    variables = tuple(words.get(key) or _variable(key, shapes[key]) for key in wanted)
     kind, analysis = _kind(_Once(one), name, tuple(values), type(system), variables, computes)
     axes = tuple(Axis(key, kind.parameter(key), None, numbers) for key, numbers in values.items())
     dims = dict.fromkeys(dim for variable in variables for dim in variable.dims)
@@ -258,9 +258,9 @@ def _with_outcome(results: Mapping[str, Array], code: Array | None) -> dict[str,
     return {n: jnp.where(finite, x, jnp.nan) if n in inexact else x for n, x in results.items()} | {OUTCOME.name: state}
 
 
-def _variable(name: str, shape: jax.ShapeDtypeStruct, described: Variable | None) -> Variable:
+def _variable(name: str, shape: jax.ShapeDtypeStruct) -> Variable:
     dtype = "int8" if shape.dtype == bool else str(shape.dtype)
-    return described or Variable(name, "1", name, tuple(f"{name}_{i}" for i in range(len(shape.shape))), dtype)
+    return Variable(name, "1", name, tuple(f"{name}_{i}" for i in range(len(shape.shape))), dtype)
 
 
 def _named(result: Any, name: str) -> dict[str, Array]:

@@ -20,16 +20,7 @@ from drivetrain_jax._wording import clipped, did_you_mean, meant, nearest, shown
 from drivetrain_jax.analysis import OUTCOME, Analysis, Request, Solver, analyses_of, get_analysis
 from drivetrain_jax.analysis._base import checked, checked_solvers, dimensions_of, make_request
 from drivetrain_jax.runs import toml
-from drivetrain_jax.runs.axes import (
-    MAX_POINTS,
-    MAX_RANGES,
-    Axis,
-    AxisTable,
-    check_count,
-    entry_of,
-    in_units,
-    spread,
-)
+from drivetrain_jax.runs.axes import MAX_POINTS, MAX_RANGES, Axis, AxisTable, check_count, entry_of, in_units, spread
 from drivetrain_jax.runs.physical import described, with_parameters
 from drivetrain_jax.systems import System, get_system, system_names
 

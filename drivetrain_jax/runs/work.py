@@ -331,12 +331,7 @@ class Work:
         self.executor.close()
 
     def do(
-        self,
-        job: Job,
-        receiver: Receiver | None,
-        progress: Progress,
-        first: int = 0,
-        points: np.ndarray | None = None,
+        self, job: Job, receiver: Receiver | None, progress: Progress, first: int = 0, points: np.ndarray | None = None
     ) -> None:
         """Compute or reuse all blocks of ``job``, or of some of its ``points``, and hand their results to ``receiver``.
 

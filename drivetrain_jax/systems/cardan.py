@@ -321,11 +321,7 @@ class Cardan(System):
     def linear_rows(self, tau: Any) -> Rows:
         """``A(tau)`` of ``y' = A y``, ``y = (theta1, theta2, theta1', theta2')``, homogeneous part of eq. (4)."""
         e, p = self.damping_and_stiffness(tau)
-        return (
-            (0, 0, 1.0, 0),
-            (0, 0, 0, 1.0),
-            *(tuple(-entry for entry in (*p[i], *e[i])) for i in range(2)),
-        )
+        return ((0, 0, 1.0, 0), (0, 0, 0, 1.0), *(tuple(-entry for entry in (*p[i], *e[i])) for i in range(2)))
 
     def linear_field(self, tau: Any, y: Array) -> Array:
         """Right-hand side of the forced linear equations, eq. (4)."""

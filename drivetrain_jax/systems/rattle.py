@@ -114,10 +114,7 @@ class Rattle(System):
     physical = PHYSICAL
     time_units = "s"
     roles = MappingProxyType({"speed": "omega", "initial_displacement": "u0", "initial_rate": "v0", "half_play": "b"})
-    state = (
-        Component("u", "m", "relative displacement"),
-        Component("v", "m/s", "relative velocity"),
-    )
+    state = (Component("u", "m", "relative displacement"), Component("v", "m/s", "relative velocity"))
 
     omega: Number = parameter("rad/s", "frequency of the drive", symbol="ω", **POSITIVE)
     B0: Number = parameter("m/s2", "mean of the drive")

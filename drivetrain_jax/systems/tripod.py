@@ -422,14 +422,7 @@ class Tripod(System):
     )
     excitation_frequency: Number | None = positive("Hz", "excitation frequency", derived="Omega/pi")
     chi_n: Number | None = parameter(
-        "1",
-        "nonuniformity",
-        symbol="χ",
-        derived="chi_source",
-        lower=-1.0,
-        upper=1.0,
-        open_lower=True,
-        open_upper=True,
+        "1", "nonuniformity", symbol="χ", derived="chi_source", lower=-1.0, upper=1.0, open_lower=True, open_upper=True
     )
     chi_source: str = parameter(
         "1", "where chi_n comes from if it is not given", default="derived", choices=CHI_SOURCES

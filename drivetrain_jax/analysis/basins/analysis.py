@@ -128,9 +128,7 @@ ANALYSIS = Analysis(
     variables=VARIABLES,
     default_outputs=("basin_fraction", "basin_error", "attractor_u_max", "attractor_multiple", "unsettled_fraction"),
     methods={"exact": tuple(option.name for option in OPTIONS)},
-    method_titles={
-        "exact": "exact motion from impact to impact, from random initial states",
-    },
+    method_titles={"exact": "exact motion from impact to impact, from random initial states"},
     options=OPTIONS,
     patience="most_periods",
     solvers=_solvers,

@@ -144,13 +144,11 @@ def _search(shaft: Shaft, modes: int) -> _Brackets:
 def _advance(shaft: Shaft, index: Array, count: int, brackets: _Brackets, most: int) -> _Brackets:
     """Steps ``count`` to ``most`` of all brackets, or until they are closed."""
 
-    def open_ones(state: tuple[Array, _Brackets]) -> Array:
-        return (state[0] < most) & ~jnp.all(_closed(state[1]))
-
-    def advance(state: tuple[Array, _Brackets]) -> tuple[Array, _Brackets]:
-        return state[0] + 1, _step(shaft, index, state[1])
-
-    return jax.lax.while_loop(open_ones, advance, (jnp.int32(count), brackets))[1]
+    return jax.lax.while_loop(
+        lambda state: (state[0] < most) & ~jnp.all(_closed(state[1])),
+        lambda state: (state[0] + 1, _step(shaft, index, state[1])),
+        (jnp.int32(count), brackets),
+    )[1]
 
 
 def _finish(shaft: Shaft, brackets: _Brackets, room: int) -> _Brackets:
@@ -158,9 +156,6 @@ def _finish(shaft: Shaft, brackets: _Brackets, room: int) -> _Brackets:
     shape = brackets.high.shape
     lanes = math.prod(shape[1:])
     fields = jax.tree.map(lambda field: field.reshape(len(field), lanes), shaft.spread())
-
-    def some_left(state: tuple[_Brackets, Array]) -> Array:
-        return jnp.any(state[1])
 
     def some(state: tuple[_Brackets, Array]) -> tuple[_Brackets, Array]:
         flat, left = state
@@ -171,7 +166,7 @@ def _finish(shaft: Shaft, brackets: _Brackets, room: int) -> _Brackets:
         return jax.tree.map(lambda x, new: x.at[place].set(new), flat, done), left.at[place].set(False)
 
     flat = jax.tree.map(lambda x: x.reshape(-1), brackets)
-    flat, _ = jax.lax.while_loop(some_left, some, (flat, ~_closed(flat)))
+    flat, _ = jax.lax.while_loop(lambda state: jnp.any(state[1]), some, (flat, ~_closed(flat)))
     return jax.tree.map(lambda x: x.reshape(shape), flat)
 
 

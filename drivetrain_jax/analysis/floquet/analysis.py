@@ -105,25 +105,18 @@ def direct_solvers(
 FORMS = ("reduced", "published")
 
 
-def _direct_solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
-    rtol = request.options["rtol"]
-    return direct_solvers(
-        system,
-        rtol,
-        rtol / 4,
-        lambda model: model.direct,
-        lambda model, z, factors: results(z, request.outputs, rtol, model, factors=factors),
-        damped=True,
-    )
-
-
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
-    if request.method != "diffrax":
-        return _direct_solvers(system, request)
-    # diffrax takes as long to import as jax, and readers of results do not need it.
-    from drivetrain_jax.analysis.floquet.diffrax_solvers import diffrax_solvers
+    if request.method == "diffrax":
+        # diffrax takes as long to import as jax, and readers of results do not need it.
+        from drivetrain_jax.analysis.floquet.diffrax_solvers import diffrax_solvers
 
-    return diffrax_solvers(system, request)
+        return diffrax_solvers(system, request)
+    rtol = request.options["rtol"]
+
+    def found(model: FloquetModel, z: Monodromy, factors: Callable[[], Factored]) -> dict[str, Array]:
+        return results(z, request.outputs, rtol, model, factors=factors)
+
+    return direct_solvers(system, rtol, rtol / 4, lambda model: model.direct, found, damped=True)
 
 
 # Target of the predicted panels of derivatives, tight because derivatives lose some digits against multipliers.

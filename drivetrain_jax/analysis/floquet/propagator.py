@@ -373,12 +373,7 @@ class Factored(NamedTuple):
 
 
 def _factors_of_block(
-    marches: list[Panels],
-    fixed: list[Fixed],
-    ends: Array | None,
-    determinant: Array | None,
-    lanes: int,
-    panels: Array,
+    marches: list[Panels], fixed: list[Fixed], ends: Array | None, determinant: Array | None, lanes: int, panels: Array
 ) -> Factored:
     """By simultaneous iteration over several periods: subspaces of separate moduli are those of the last period."""
     n = marches[0].size

@@ -556,9 +556,7 @@ ANALYSIS = Analysis(
     variables=(),
     default_outputs=("periodic_state", "amplitude", "condition"),
     methods={"shooting": ("rtol",)},
-    method_titles={
-        "shooting": "periodic orbit by Newton's method over one period",
-    },
+    method_titles={"shooting": "periodic orbit by Newton's method over one period"},
     options=(RTOL,),
     solvers=_solvers,
     dimensions=_dimensions,

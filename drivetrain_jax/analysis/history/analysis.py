@@ -76,11 +76,6 @@ def _period(build: Callable[..., Flow], size: int | None, values: Mapping[str, A
     return jnp.asarray(flow.period)
 
 
-def _has_play(system: type[System]) -> bool:
-    """True if the model is an oscillator with play and no flow."""
-    return system.models["history"].returns is PiecewiseLinearOscillator
-
-
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     name = f"diffrax: {request.options['solver']}"
     solve, effort = partial(_solve, system, request), partial(_effort, system, request)
@@ -95,7 +90,8 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
 def _of_system(system: type[System]) -> dict[str, Any]:
     """The components of the state, and their errors; for an oscillator with play also its methods."""
     names = tuple(c.name for c in system.state)
-    if _has_play(system):
+    # An oscillator with play is no flow.
+    if system.models["history"].returns is PiecewiseLinearOscillator:
         shared = tuple(
             o for o in ANALYSIS.options if o.name in {o for used in piecewise.METHODS.values() for o in used}
         )
@@ -114,11 +110,7 @@ def _of_system(system: type[System]) -> dict[str, Any]:
     errors = tuple(
         Variable(f"{c.name}_error", c.units, f"estimated absolute error of {c.name}", dims) for c in system.state
     )
-    return {
-        "variables": values + errors,
-        "default_outputs": names,
-        "options": in_time_of(system, ANALYSIS.options),
-    }
+    return {"variables": values + errors, "default_outputs": names, "options": in_time_of(system, ANALYSIS.options)}
 
 
 ANALYSIS = Analysis(
@@ -127,18 +119,10 @@ ANALYSIS = Analysis(
     variables=(),
     default_outputs=(),
     methods={"diffrax": ("times", "stop", "num", "rtol", "solver")},
-    method_titles={
-        "diffrax": "adaptive steps from strobe to strobe",
-    },
+    method_titles={"diffrax": "adaptive steps from strobe to strobe"},
     options=(
         Parameter(
-            "times",
-            "s",
-            "times at which the state is wanted",
-            default=(),
-            listed=True,
-            lower=0.0,
-            upper=MOST_SECONDS,
+            "times", "s", "times at which the state is wanted", default=(), listed=True, lower=0.0, upper=MOST_SECONDS
         ),
         Parameter("stop", "s", "end of the history (0: see times)", default=0.0, lower=0.0, upper=MOST_SECONDS),
         NUM,

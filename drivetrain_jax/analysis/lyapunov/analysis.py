@@ -510,9 +510,7 @@ ANALYSIS = Analysis(
     variables=VARIABLES,
     default_outputs=("lyapunov_spectrum", "lyapunov_standard_error", "sum_rule_residual", "verdict"),
     methods={"benettin": tuple(option.name for option in OPTIONS)},
-    method_titles={
-        "benettin": "the variational equations: multipliers of an orbit, or averages (Benettin)",
-    },
+    method_titles={"benettin": "the variational equations: multipliers of an orbit, or averages (Benettin)"},
     options=OPTIONS,
     solvers=_solvers,
     dimensions=_dimensions,

@@ -143,11 +143,6 @@ class _March(NamedTuple):
     orbit: Orbit
 
 
-def strobes_per_segment(flow: Flow, max_time: float) -> Array:
-    """Strobes in each of ``SEGMENTS`` equal parts of ``max_time``, at least one, shape ``(...)``."""
-    return jnp.ceil(jnp.asarray(max_time / flow.period / SEGMENTS)).astype(jnp.int64)
-
-
 def state_size(flow: Flow, y: Vector) -> Array:
     """Largest modulus of the components without phases and angles, which grow even if the motion is bounded."""
     kept = [abs(x) for i, x in enumerate(y) if i not in (*flow.phases, *flow.cyclic)] or [abs(x) for x in y]
@@ -166,7 +161,9 @@ def record_growth(
     """
     frame = initial_frame(flow)
     shape = frame.state[0].shape
-    length = jnp.broadcast_to(strobes_per_segment(flow, max_time), shape)
+    # Strobes in each of the equal parts of ``max_time``, at least one.
+    strobes = jnp.ceil(jnp.asarray(max_time / flow.period / SEGMENTS)).astype(jnp.int64)
+    length = jnp.broadcast_to(strobes, shape)
     record, growth = jnp.zeros((SEGMENTS, *shape)), jnp.zeros((SEGMENTS, len(frame.tangents[0]), *shape))
     active = jnp.broadcast_to(active, shape)
     start = _March(

@@ -530,10 +530,7 @@ ANALYSIS = Analysis(
     variables=VARIABLES,
     default_outputs=("natural_frequency", "mode_type", "dominant_family", "dominant_share"),
     methods=dict.fromkeys(("auto", "full"), tuple(option.name for option in OPTIONS)),
-    method_titles={
-        "auto": "by the invariant blocks of a symmetry, if there is one",
-        "full": "always the whole matrix",
-    },
+    method_titles={"auto": "by the invariant blocks of a symmetry, if there is one", "full": "always the whole matrix"},
     options=OPTIONS,
     solvers=_solvers,
     dimensions=_dimensions,

@@ -161,11 +161,7 @@ def follow(
         return (state[0] < attempts) & jnp.any(_going(state[1], limits))
 
     begin = _Front(
-        first,
-        jnp.full(lanes.shape, longest),
-        jnp.zeros_like(lanes),
-        jnp.zeros((2, lanes.size)),
-        first.steps,
+        first, jnp.full(lanes.shape, longest), jnp.zeros_like(lanes), jnp.zeros((2, lanes.size)), first.steps
     )
     *_, store = jax.lax.while_loop(unfinished, step, (jnp.asarray(1), begin, store))
     n = x.shape[0] - 1
@@ -192,11 +188,7 @@ def _straight(front: _Front, there: _Solved) -> Array:
 
 
 def _moved(
-    front: _Front,
-    there: _Solved,
-    good: Array,
-    longest: float,
-    limits: tuple[Array | float, Array | float],
+    front: _Front, there: _Solved, good: Array, longest: float, limits: tuple[Array | float, Array | float]
 ) -> _Front:
     """The front at ``there`` where it is ``good``, or else the old one with a shorter step.
 

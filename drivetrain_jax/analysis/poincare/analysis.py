@@ -114,7 +114,9 @@ def section_errors(
         unknown = jnp.isinf(error) | doubtful
 
         def found() -> Array:
-            distance = _distance(flow, states, first, count) / size
+            start = discarded(flow, count, jnp.int64(first))
+            others, _ = sampled(flow, count, start, jnp.int64(first), len(states))
+            distance = jnp.max(jnp.abs(others - states)[:, watched(flow)], axis=(0, 1)) / size
             return jnp.where(unknown, jnp.where(distance <= _PROPORTIONAL, distance * share, distance), error)
 
         return jax.lax.cond(jnp.any(unknown), found, lambda: error), None
@@ -150,13 +152,6 @@ def _share(errors: Array, changes: Array) -> Array:
     considerable = (changes > 0) & (changes >= _CONSIDERABLE * largest)
     ratio = jnp.where(considerable, errors / jnp.where(considerable, changes, 1.0), 0.0)
     return jnp.where(largest > 0, jnp.max(ratio, axis=0), 1.0)
-
-
-def _distance(flow: Flow, states: Array, first: int, steps: Array) -> Array:
-    """Largest distance of ``states`` from the motion with ``steps`` equal steps per strobe, shape ``(...)``."""
-    start = discarded(flow, steps, jnp.int64(first))
-    others, _ = sampled(flow, steps, start, jnp.int64(first), len(states))
-    return jnp.max(jnp.abs(others - states)[:, watched(flow)], axis=(0, 1))
 
 
 VARIABLES = (
@@ -263,15 +258,11 @@ def measures(flow: Flow, states: Array, request: Request) -> dict[str, Array]:
         distinct = period_multiple(states[:, kept], jnp.float64(_DISTINCT), min(_LONGEST, len(states) // 2))
         results["distinct_points"] = distinct.astype(jnp.int32)
     if "chaos_k01" in request.outputs:
-        results["chaos_k01"] = _k01(states[-_SAMPLES:, kept], distinct)
+        last = states[-_SAMPLES:, kept]
+        k01 = largest_k01(last) if len(last) >= _FEWEST_SAMPLES else jnp.full(last.shape[2:], jnp.nan)
+        # The limit 0 if the section repeats: a short record of few points may look like diffusion.
+        results["chaos_k01"] = jnp.where(distinct > 0, 0.0, k01)
     return results
-
-
-def _k01(section: Array, distinct: Array) -> Array:
-    """K of the section, or its limit 0 if the section repeats: a short record of few points may look like diffusion."""
-    enough = len(section) >= _FEWEST_SAMPLES
-    k01 = largest_k01(section) if enough else jnp.full(section.shape[2:], jnp.nan)
-    return jnp.where(distinct > 0, 0.0, k01)
 
 
 def _angle(flow: Flow, strobes: Array) -> Array | None:

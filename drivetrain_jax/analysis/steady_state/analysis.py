@@ -137,13 +137,7 @@ VARIABLES = (
     Variable("periods_settled", "1", "drive periods until the attractor was recognised", dtype="int32"),
 )
 WAIT = Parameter(
-    "most_periods",
-    "1",
-    "largest number of drive periods of a motion",
-    default=4000,
-    lower=64,
-    upper=1e8,
-    integer=True,
+    "most_periods", "1", "largest number of drive periods of a motion", default=4000, lower=64, upper=1e8, integer=True
 )
 # Points per chunk: so many that the lanes are busy until the queue is nearly empty.
 _CHUNK = 4096
@@ -207,9 +201,7 @@ ANALYSIS = Analysis(
     variables=VARIABLES,
     default_outputs=("u_max", "u_min", "u_rms", "period_multiple", "spectral_radius", "regime", "impacts"),
     methods={"exact": ("rtol", "most_periods")},
-    method_titles={
-        "exact": "exact motion from impact to impact, until it repeats",
-    },
+    method_titles={"exact": "exact motion from impact to impact, until it repeats"},
     options=(RTOL, WAIT),
     patience="most_periods",
     solvers=_solvers,
