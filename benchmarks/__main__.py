@@ -20,7 +20,7 @@ from pathlib import Path
 
 from benchmarks.measure import RESULTS, parser, results_folder
 from benchmarks.page import PAGE, ROOT, write_page, write_pages
-from drivetrain_jax._wording import nearest
+from drivetrain_jax._errors import nearest
 from drivetrain_jax.cli import WRONG_INPUT, one_line
 
 INTERRUPTED = 130

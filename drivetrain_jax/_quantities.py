@@ -11,7 +11,7 @@ from numbers import Real
 from typing import Any
 
 from drivetrain_jax import _units
-from drivetrain_jax._wording import shown
+from drivetrain_jax._errors import shown
 
 _QUOTIENT = re.compile(r"\s*([+-]?\d{1,9})\s*/\s*([1-9]\d{0,8})\s*")
 # First code of ``outcome`` without a value.

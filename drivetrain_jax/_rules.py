@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from drivetrain_jax._wording import shown
+from drivetrain_jax._errors import shown
 
 # Relative tolerance for the rounding of a formula evaluated in another order.
 ROUNDING = 1e-9

@@ -24,8 +24,7 @@ from jax import Array
 from jax.custom_batching import custom_vmap
 
 from drivetrain_jax import _programs
-from drivetrain_jax._errors import InputError
-from drivetrain_jax._wording import did_you_mean
+from drivetrain_jax._errors import InputError, did_you_mean
 from drivetrain_jax.analysis import OUTCOME, Analysis, Dimension, Outcome, Request, Solver, analyses_of, get_analysis
 from drivetrain_jax.analysis._base import checked_solvers, dimensions_of, make_request
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few

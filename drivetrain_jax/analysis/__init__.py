@@ -9,9 +9,9 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from drivetrain_jax._errors import nearest
 from drivetrain_jax._plugins import ANALYSES, load_plugin, plugin_names
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax._wording import nearest
 
 if TYPE_CHECKING:
     from drivetrain_jax.analysis._base import OUTCOME, RTOL, Analysis, Outcome, Request, Solver, forward_derivatives

@@ -14,9 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, did_you_mean, nearest, shown
 from drivetrain_jax._quantities import FIRST_FAILURE, Dimension, Parameter, Variable
-from drivetrain_jax._wording import did_you_mean, nearest, shown
 from drivetrain_jax.systems import Model, System
 
 

@@ -18,9 +18,8 @@ from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
 from drivetrain_jax import _units
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, shown
 from drivetrain_jax._quantities import Parameter
-from drivetrain_jax._wording import shown
 from drivetrain_jax.store.files import ATLAS_PREFACE
 
 if TYPE_CHECKING:

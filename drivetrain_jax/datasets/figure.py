@@ -14,9 +14,8 @@ import numpy as np
 import xarray as xr
 
 from drivetrain_jax import view
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, shown
 from drivetrain_jax._rules import BUILT_IN as declared
-from drivetrain_jax._wording import shown
 from drivetrain_jax.resonances import BUILT_IN, Resonances
 from drivetrain_jax.view.style import is_joined, parameters, scene_key
 from drivetrain_jax.view.units import check_measured, in_units, listed, size

@@ -14,10 +14,10 @@ import numpy as np
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import shown as quoted
 from drivetrain_jax._programs import program_identity, remembered
 from drivetrain_jax._quantities import Parameter
 from drivetrain_jax._units import factor
-from drivetrain_jax._wording import shown as quoted
 from drivetrain_jax.atlas import to_arrays
 from drivetrain_jax.atlas.boundaries import boundaries
 from drivetrain_jax.atlas.criteria import has_boundaries

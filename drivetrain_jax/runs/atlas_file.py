@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from drivetrain_jax import _programs
-from drivetrain_jax._errors import InputError
-from drivetrain_jax._wording import counted, did_you_mean, shown
+from drivetrain_jax._errors import InputError, counted, did_you_mean, shown
 from drivetrain_jax.analysis import OUTCOME, Request, get_analysis
 from drivetrain_jax.analysis._base import make_request
 from drivetrain_jax.analysis.atlas import ANALYSIS

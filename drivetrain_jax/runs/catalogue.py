@@ -5,9 +5,8 @@ from __future__ import annotations
 import tomllib
 from pathlib import Path
 
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, aligned, did_you_mean, nearest, written
 from drivetrain_jax._quantities import Parameter, Variable
-from drivetrain_jax._wording import aligned, did_you_mean, nearest, written
 from drivetrain_jax.analysis import analyses_of, analysis_names, broken_analyses, get_analysis
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.scene import find_system

@@ -18,10 +18,9 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax import analyses
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, nearest, shown
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax._units import with_unit
-from drivetrain_jax._wording import nearest, shown
 from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analysis_names
 from drivetrain_jax.analysis._base import checked
 from drivetrain_jax.analysis.numerics.lanes import over_lanes

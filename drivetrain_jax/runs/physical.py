@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drivetrain_jax import _units
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, clipped, shown
 from drivetrain_jax._quantities import Parameter
-from drivetrain_jax._wording import clipped, shown
 from drivetrain_jax.analysis._base import checked
 from drivetrain_jax.runs.axes import Axis, entry_of
 from drivetrain_jax.systems import PhysicalData, System

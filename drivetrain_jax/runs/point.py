@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, aligned, did_you_mean, meant, shown, written
 from drivetrain_jax._quantities import Variable
-from drivetrain_jax._wording import aligned, did_you_mean, meant, shown, written
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, get_analysis
 from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range, orders_of
 from drivetrain_jax.runs import toml

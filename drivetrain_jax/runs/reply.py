@@ -17,10 +17,9 @@ import jax
 import numpy as np
 
 from drivetrain_jax import _units
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, shown
 from drivetrain_jax._programs import compiled, program_identity
 from drivetrain_jax._quantities import Parameter
-from drivetrain_jax._wording import shown
 from drivetrain_jax.analysis import get_analysis
 from drivetrain_jax.analysis._base import checked, make_request
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 
 import drivetrain_jax
-from drivetrain_jax._errors import InputError
-from drivetrain_jax._wording import clipped, counted
+from drivetrain_jax._errors import InputError, clipped, counted
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.analysis.atlas import ANALYSIS
 from drivetrain_jax.runs.assemble import misfits, sweep_first

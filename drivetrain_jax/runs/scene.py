@@ -13,10 +13,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, clipped, did_you_mean, meant, nearest, shown
 from drivetrain_jax._machine import physical_memory
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax._wording import clipped, did_you_mean, meant, nearest, shown
 from drivetrain_jax.analysis import OUTCOME, Analysis, Request, Solver, analyses_of, get_analysis
 from drivetrain_jax.analysis._base import checked, checked_solvers, dimensions_of, make_request
 from drivetrain_jax.runs import toml

@@ -16,9 +16,8 @@ import msgspec
 import numpy as np
 
 import drivetrain_jax
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, did_you_mean, nearest, shown
 from drivetrain_jax._units import with_unit
-from drivetrain_jax._wording import did_you_mean, nearest, shown
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 

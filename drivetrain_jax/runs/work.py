@@ -18,10 +18,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from drivetrain_jax._errors import ChunkError, InputError, RetryableError
+from drivetrain_jax._errors import ChunkError, InputError, RetryableError, shown
 from drivetrain_jax._machine import threads, usable_cores
 from drivetrain_jax._quantities import FIRST_FAILURE
-from drivetrain_jax._wording import shown
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import BlockStore, ResultBuffer, labelled, stored_blocks
 from drivetrain_jax.runs.job import Block, Chunk, Job, Results

@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from drivetrain_jax._errors import InputError
-from drivetrain_jax._wording import counted
+from drivetrain_jax._errors import InputError, counted
 from drivetrain_jax.store.consolidate import DETAILS, GROUP, Labelled
 from drivetrain_jax.store.files import digest, flush, source_digest, sync_folder
 from drivetrain_jax.store.parts import Place, Shards

@@ -24,10 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, meant, nearest
 from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
 from drivetrain_jax._units import is_unit, with_unit
-from drivetrain_jax._wording import meant, nearest
 from drivetrain_jax.resonances import Resonances, Values
 from drivetrain_jax.systems._models import (
     DrivenSprings,

@@ -16,9 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, counted
 from drivetrain_jax._quantities import Parameter
-from drivetrain_jax._wording import counted
 from drivetrain_jax.systems._base import POSITIVE, Conversion, Number, PhysicalData, System, numeric, parameter, serves
 from drivetrain_jax.systems._models import Shaft, stack
 

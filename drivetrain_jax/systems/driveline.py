@@ -22,8 +22,8 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
+from drivetrain_jax._errors import counted
 from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
-from drivetrain_jax._wording import counted
 from drivetrain_jax.resonances import DRIVELINE
 from drivetrain_jax.systems._base import (
     POSITIVE,

@@ -20,9 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, counted
 from drivetrain_jax._quantities import Parameter
-from drivetrain_jax._wording import counted
 from drivetrain_jax.systems._base import (
     POSITIVE,
     Conversion,

@@ -13,8 +13,7 @@ import numpy as np
 import xarray as xr
 
 from drivetrain_jax import _units
-from drivetrain_jax._errors import InputError
-from drivetrain_jax._wording import shown
+from drivetrain_jax._errors import InputError, shown
 
 # The attribute with the units asked for, and the mark of a converted variable, which takes no further prefix.
 ASKED, CONVERTED = "figure_units", "converted"
