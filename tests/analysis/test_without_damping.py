@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -102,17 +103,16 @@ EDGES = np.array([
 ]).T  # fmt: skip
 
 
-@pytest.mark.parametrize("method", full_after(1, ["direct", "diffrax"]))
-def test_bounds_hold_where_solutions_grow_within_the_period(method):
+@pytest.mark.parametrize(
+    ("method", "rtol"), full_after(1, itertools.product(["direct", "diffrax"], [1e-9, 1e-6, 1e-12]), several=True)
+)
+def test_bounds_hold_where_solutions_grow_within_the_period(method, rtol):
     a, q, above = EDGES
     exact = np.where(above > 0, 1 + above + np.sqrt(np.maximum(above * (2 + above), 0)), 1.0)
-    for rtol in (1e-6, 1e-9, 1e-12):
-        found = jax.vmap(
-            lambda a, q: dt.floquet(Mathieu(a=a, q=q), outputs=OUTPUTS, method=method, rtol=rtol)  # noqa: B023
-        )(a, q)
-        error = np.abs(np.asarray(found.spectral_radius) - exact)
-        assert np.all(error <= found.spectral_radius_error), error / found.spectral_radius_error
-        assert not np.any((found.verdict == 0) & (exact > 1)) and not np.any((found.verdict == 1) & (exact == 1))
+    found = jax.vmap(lambda a, q: dt.floquet(Mathieu(a=a, q=q), outputs=OUTPUTS, method=method, rtol=rtol))(a, q)
+    error = np.abs(np.asarray(found.spectral_radius) - exact)
+    assert np.all(error <= found.spectral_radius_error), error / found.spectral_radius_error
+    assert not np.any((found.verdict == 0) & (exact > 1)) and not np.any((found.verdict == 1) & (exact == 1))
     assert found.verdict[-2:].tolist() == [1, 1]
 
 

@@ -111,7 +111,7 @@ def many(count):
     return settings(max_examples=count, **FUZZ)
 
 
-@many(80)
+@many(40)
 @given(scenes())
 @example(
     GOOD | {"axes": {"a": {"start": 0.0, "stop": 10.0, "num": 10**6}, "b": {"start": 1.0, "stop": 2.0, "num": 10**6}}}

@@ -90,7 +90,7 @@ def test_field_linearisation_and_forcing_are_those_of_the_reference(name):
         assert set(case["ratio"]) != {1.0}
 
 
-@pytest.mark.parametrize("name", full_after(1, ["ref2", "ref3", "ref1", "ref4", "ref5", "ref6"]))
+@pytest.mark.parametrize("name", full_after(1, ["ref1", "ref2", "ref3", "ref4", "ref5", "ref6"]))
 def test_multipliers_are_those_of_the_reference(name):
     found = dt.floquet(of_case(name), outputs=[*MULTIPLIERS, "liouville_residual"], rtol=1e-12)
     expected = [complex(*z) for z in CASES[name]["multipliers_absolute"]]

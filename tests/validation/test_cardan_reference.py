@@ -46,7 +46,7 @@ def result(request):
     outputs = ["spectral_radius", "spectral_radius_error", "verdict", "floquet_multiplier"]
     columns = {name: [POINTS[i][name] for i in request.param] for name in NAMES}
     if request.param is USUAL:
-        found = FloquetBatch("direct")(columns)
+        found = FloquetBatch("direct", outputs=outputs)(columns)
         dataset = xr.Dataset({name: (("point", "multiplier")[: x.ndim], x) for name, x in found.items()})
     else:
         dataset = dt.run({"system": "cardan", "analysis": "floquet", "outputs": outputs, "points": columns})
