@@ -518,17 +518,17 @@ def point(options: argparse.Namespace) -> int:
     """Print the results of one point."""
     from drivetrain_jax.runs.point import point
 
-    given = _tabulated(options) | assignments(options.given, "point")
+    given = assignments(options.given, "point")
     for name in ("system", "analysis"):
         if name in given:
             raise InputError(f"{name} = {given[name]!r}: given twice; allowed is once, in front of the values")
-    for name in ("amplitude", "sensitivities"):
+    for name in ("amplitude", "sensitivities", "data"):
         if name in given:
             raise InputError(f"{name} = {given[name]!r}: not a parameter; did you mean the option --{name}?")
     outputs = given.pop("outputs", None)
     if isinstance(outputs, str):
         outputs = outputs.split(",")
-    asked = {"amplitude": options.amplitude, "sensitivities": options.sensitivities}
+    asked = {"amplitude": options.amplitude, "sensitivities": options.sensitivities, "data": options.data}
     return _answer(point(options.system, options.analysis, outputs=outputs, **asked, **given), options)
 
 

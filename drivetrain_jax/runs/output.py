@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 import drivetrain_jax
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, did_you_mean
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import (
     PENDING,
@@ -82,9 +82,10 @@ class Output:
         return InputError(f"out = {str(self.out)!r}: {text}")
 
     def _check_folders(self) -> None:
-        folder, parts = self.out.parent, self.parts.path
-        if self.out.suffix.lower() in _FOREIGN:
-            raise self._error("a result is a netCDF file; allowed is a name that ends in .nc")
+        folder, parts, ending = self.out.parent, self.parts.path, self.out.suffix.lower()
+        guess = did_you_mean(ending, (".zarr",)) if ending != ".zarr" else ""
+        if guess or ending in _FOREIGN:
+            raise self._error(f"a result is netCDF or Zarr; allowed is a name that ends in .nc or .zarr{guess}")
         try:
             if not folder.is_dir():
                 raise self._error(f"the folder {str(folder)!r} does not exist; allowed is a file in an existing folder")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, KeysView, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,7 @@ from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_r
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.job import Job
-from drivetrain_jax.runs.physical import described
+from drivetrain_jax.runs.physical import described, read_table
 from drivetrain_jax.runs.reply import Limit, Reply, growth_lines, growth_of, speed_in_rpm
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import Scene, load_scene, system_and_analysis
@@ -188,6 +190,7 @@ def point(
     outputs: Sequence[str] | None = None,
     amplitude: Any = None,
     sensitivities: bool = False,
+    data: str | PathLike[str] | None = None,
     **given: Any,
 ) -> PointResult:
     """The results of one point.
@@ -197,7 +200,9 @@ def point(
         outputs: results to compute; default: those of the analysis.
         amplitude: limit of the forced amplitude (``"2 deg"``), with which the answer compares the forced motion.
         sensitivities: adds those of the spectral radius, by the given physical data or the parameters.
-        given: parameters of the system (or its physical data), and options of the analysis (``method``, ``rtol``, ...).
+        data: a table of parameters (``.csv``, ``.xlsx``), a column each with its unit (``length [mm]``).
+        given: parameters of the system (or its physical data), and options of the analysis (``method``, ``rtol``, ...);
+            they override ``data``.
 
     Raises: :class:`InputError` with one line that names the field, the value and what is allowed; :class:`ChunkError` if
     the computation fails.
@@ -207,6 +212,8 @@ def point(
     >>> print(f"{found.spectral_radius:.8f}", found.outcome.name)
     1.03193549 SUCCESS
     """
+    if data is not None:
+        given = read_table(Path(data)) | given
     tree = _tree(system, analysis, {name: toml.plain(value) for name, value in given.items()})
     if outputs is not None:
         outputs = [outputs] if isinstance(outputs, str) else outputs

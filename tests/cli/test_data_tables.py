@@ -5,6 +5,7 @@ import json
 import openpyxl
 import pytest
 
+import drivetrain_jax as dt
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.cli import main
 from drivetrain_jax.runs.physical import read_table
@@ -41,6 +42,8 @@ def test_a_shaft_from_a_table_has_its_critical_speeds(tmp_path, capsys, kind):
         assert main(["point", "bicardan", "critical_speeds", "modes=3", "--data", str(path), "--json"]) == 0
         speeds = json.loads(capsys.readouterr().out)["values"]["critical_speed"]["value"]
         assert [round(speed) for speed in speeds] == [3647, 8088, 13019]
+        stiff = dt.point("bicardan", "critical_speeds", data=path, k_A="50 MN/m", modes=3)
+        assert stiff.parameters["k_A"] == 5e7 and stiff.parameters["k_D"] == 5e6
 
 
 def test_a_scene_takes_a_table_and_the_command_line_overrides_it(tmp_path, capsys):
