@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.frequency_response.closed_form_response import cubic_fit
-from drivetrain_jax.analysis.history.piecewise import averaged_flow
+from drivetrain_jax.analysis.history.analysis import averaged_flow
 from tests.oracles.rattle_reference import field
 from tests.sizes import full_after
 

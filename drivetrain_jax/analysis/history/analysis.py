@@ -14,8 +14,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -30,27 +31,269 @@ from drivetrain_jax.analysis._base import (
     Outcome,
     Request,
     Solver,
+    finite_results,
     forward_derivatives,
     in_time_of,
 )
-from drivetrain_jax.analysis.history import piecewise
-from drivetrain_jax.analysis.history.integration import NUM, has_finite_start, integrated, limits_of, requested_times
-from drivetrain_jax.analysis.numerics.kernels import predicted
+from drivetrain_jax.analysis.frequency_response.closed_form_response import cubic_fit, self_consistent_range, slow_flow
+from drivetrain_jax.analysis.history.integration import (
+    NUM,
+    History,
+    has_finite_start,
+    integrated,
+    limits_of,
+    requested_times,
+)
+from drivetrain_jax.analysis.impacts.motion import to_scaled_length
+from drivetrain_jax.analysis.impacts.piecewise_march import (
+    Lanes,
+    Motion,
+    advance,
+    allowed_steps,
+    locate,
+    next_step,
+    prepare,
+    start,
+)
+from drivetrain_jax.analysis.numerics.kernels import predicted, stored
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.systems import Flow, PiecewiseLinearOscillator, System
+
+# Time histories of oscillators with play: the exact motion with its events, and the averaged motion.
+#
+# Method ``exact``: the closed form of each linear region from flank to flank, exact up to rounding at any time.
+#
+# Method ``slow_flow``: amplitude a and phase beta of ``u = a cos(omega t - beta)`` by the averaged equations of
+# :mod:`~drivetrain_jax.analysis.frequency_response.closed_form_response`, with ``u' = -w0 a sin(omega t - beta)``. The
+# complex amplitude ``z = a exp(i beta)`` has no singularity at rest:
+#
+#     z' = (-mu + i (omega - w0 - g |z|^2)) z + i F.
+#
+# Outcome: ``NOT_FINITE`` without a finite motion (resonance without damping; a fit with l1 <= 0); ``STEP_LIMIT`` for more
+# events than a motion can have unless it grazes a flank; ``slow_flow`` also ``TOLERANCE_NOT_MET``.
+
+
+# States at given times and events of a motion of a piecewise linear oscillator from any start, exact up to rounding.
+
+
+DRIVE, BACK, NO_EVENT = range(3)
+
+
+class Events(NamedTuple):
+    """Contacts made and lost, in order: ``time``, number of the ``flank`` and ``velocity``, shape ``(events, N)``.
+
+    After the last event, entries are NaN and ``NO_EVENT``. The ``number`` (N,) of events may exceed the length of the list.
+    """
+
+    time: Array
+    flank: Array
+    velocity: Array
+    number: Array
+
+
+class _Walk(NamedTuple):
+    """State of the march: the motion, whose periods ``left`` count down from 0, and the events so far."""
+
+    motion: Motion
+    events: Events
+
+
+def timed_motion(
+    oscillator: PiecewiseLinearOscillator, u: Array, v: Array, times: np.ndarray, most_events: int
+) -> tuple[Array, Array, Events, Array]:
+    """Displacement and velocity ``(T, N)`` at the rising ``times``, the first ``most_events`` events, and flags ``(N,)``.
+
+    The motion starts in the state ``(u, v)`` at t = 0. A flag marks a lane that needs too many steps: a grazing motion, or
+    one whose oscillator is so much faster than its drive that it is not begun. Times are counted in whole periods and a
+    fraction, so that the phase of the drive does not drift.
+    """
+    lanes = jax.tree.map(lambda x: x + jnp.zeros(u.shape), prepare(oscillator, times[-1]))
+    turns = jnp.asarray(times)[:, None] / lanes.period
+    periods = jnp.floor(turns).astype(jnp.int32)
+    allowed = allowed_steps(lanes, times[-1])
+    most = jnp.where(allowed > 0, 2 * (periods[-1] + 1) * allowed + 2 * len(times), 0)
+    none = jnp.full((most_events, *u.shape), jnp.nan)
+    nothing = Events(none, jnp.full(none.shape, NO_EVENT, jnp.int8), none, jnp.zeros(u.shape, jnp.int32))
+
+    def to(walk: _Walk, target: tuple[Array, Array]) -> tuple[_Walk, tuple[Array, Array]]:
+        def active(motion: Motion) -> Array:
+            whole, part = target
+            early = (-motion.left < whole) | ((-motion.left == whole) & (motion.time < part))
+            return early & jnp.isfinite(motion.u) & (motion.steps < most)
+
+        walk = jax.lax.while_loop(
+            lambda w: jnp.any(active(w.motion)), lambda w: _moved(lanes, w, target, active(w.motion)), walk
+        )
+        late = jnp.where(walk.motion.steps < most, 0.0, jnp.nan)
+        return walk, (walk.motion.u + late, walk.motion.v + late)
+
+    begin = _Walk(start(lanes, u, v, jnp.zeros(u.shape, jnp.int32)), nothing)
+    end, (high, rate) = jax.lax.scan(to, begin, (periods, (turns - periods) * lanes.period))
+    return high, rate, end.events, end.motion.steps >= most
+
+
+def _moved(lanes: Lanes, walk: _Walk, target: tuple[Array, Array], active: Array) -> _Walk:
+    """The march after one step of the ``active`` lanes, at most to the ``target``: whole periods and the time after them."""
+    motion, (whole, part) = walk.motion, target
+    here = locate(lanes, motion.u)
+    # The end of a step does not influence the motion, and its derivative may be infinite: it is not differentiated.
+    d = next_step(*jax.lax.stop_gradient((lanes, here, motion)))
+    d = jnp.where(d >= lanes.period - motion.time, lanes.period - motion.time, d)
+    d = jnp.where(-motion.left == whole, jnp.minimum(d, part - motion.time), d)
+    # Stored: computed once more with another rounding, a displacement on a flank would be kept and yet not be an event.
+    moved = stored(advance)(lanes, here, motion, d)
+    after = locate(lanes, moved.u).side
+    crosses = active & (after != here.side)
+    flank = jnp.where(here.side + after > 0, DRIVE, BACK).astype(jnp.int8)
+    time = moved.time - moved.left * lanes.period
+    kept = jax.tree.map(lambda new, old: jnp.where(active, new, old), moved, motion)
+    return _Walk(kept, _recorded(walk.events, crosses, time, flank, moved.v))
+
+
+def _recorded(events: Events, crosses: Array, time: Array, flank: Array, velocity: Array) -> Events:
+    """``events`` with one more event in the lanes that cross a flank; when the list is full, the event is only counted."""
+    length = events.time.shape[0]
+    place = jnp.where(crosses, events.number, length), jnp.arange(crosses.shape[0])
+    return Events(
+        events.time.at[place].set(time, mode="drop"),
+        events.flank.at[place].set(flank, mode="drop"),
+        events.velocity.at[place].set(velocity, mode="drop"),
+        events.number + crosses,
+    )
+
+
+_TIMES = ("times", "stop", "num")
+_PLAY_METHODS = {"exact": (*_TIMES, "most_events"), "slow_flow": (*_TIMES, "rtol", "solver", "fit_range")}
+_PLAY_TITLES = {
+    "exact": "exact motion from impact to impact",
+    "slow_flow": "averaged equations of amplitude and phase (multiple scales give the same)",
+}
+_PLAY_OPTIONS = (
+    Parameter("most_events", "1", "length of the list of events", default=256, lower=1, upper=1e6, integer=True),
+    Parameter("fit_range", "m", "range R of the cubic fit (0: its own peak amplitude)", default=0.0, lower=0.0),
+)
+_FLANKS = ("drive", "back", "none")
+_EXACT = (
+    Variable("acceleration", "m/s2", "relative acceleration", ("time",)),
+    Variable("event_time", "s", "time at which contact is made or lost", ("event",)),
+    Variable("event_flank", "1", "flank of the event", ("event",), "int8", _FLANKS),
+    Variable("event_velocity", "m/s", "relative velocity at the event", ("event",)),
+    Variable("event_count", "1", "number of events, also beyond the list", dtype="int32"),
+)
+_AVERAGED = (
+    Variable("amplitude", "m", "amplitude of the averaged motion", ("time",)),
+    Variable("phase", "rad", "lag of the averaged motion behind the drive", ("time",)),
+)
+# Lists of events are longer than most motions need.
+_EVENTS = ("event_time", "event_velocity")
+_STARTS = ("initial_displacement", "initial_rate")
+_MAX_PERIODS, _PLAY_CHUNK = 2_000_000, 64
+
+
+def _play_variables(system: type[System]) -> tuple[Variable, ...]:
+    """Variables of the state of ``system``, and those that the methods add."""
+    own = (Variable(c.name, c.units, c.long_name, ("time",)) for c in system.state)
+    return (*own, *_EXACT, *_AVERAGED)
+
+
+def _play_dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
+    """Dimensions of times and events; raises ``InputError`` for a result that the method does not compute."""
+    PiecewiseLinearOscillator.check_method(fixed.get("damping") != "contact", request.method)
+    for variable in _AVERAGED if request.method == "exact" else _EXACT:
+        if variable.name in request.outputs:
+            other = next(method for method in _PLAY_METHODS if method != request.method)
+            raise InputError(
+                f"outputs: method {request.method} does not give {variable.name}; allowed for it is {other}"
+            )
+    events = tuple(range(1, request.options.get("most_events", 0) + 1))
+    return Dimension("time", "time", requested_times(request), "s"), Dimension("event", "number of the event", events)
+
+
+def _play_solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
+    """The solver of the method."""
+    effort = partial(_effort, system, request, _MAX_PERIODS)
+    if request.method == "exact":
+        return (Solver("exact", partial(_exact, system, request), effort, chunk=_PLAY_CHUNK, lengthy=True),)
+    solve = over_lanes(partial(_averaged, system, request))
+    return (Solver("slow flow", solve, effort, chunk=16, march=True, lengthy=True),)
+
+
+def _play_derivatives(
+    system: type[System], request: Request, parameters: Any, constants: Any, results: Mapping[str, Array]
+) -> Mapping[str, Array]:
+    """Jacobians of the exact motion, without its events.
+
+    The averaged motion has none, because bisection finds the range of its fit.
+    """
+    known = {name: x for name, x in results.items() if not name.startswith("event")}
+    exact = request.method == "exact"
+    return forward_derivatives(_play_solvers, system, request, parameters, constants, known) if exact else {}
+
+
+def _exact(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+    """The requested results of a batch, lanes last; ``effort`` only orders the batches."""
+    times = np.array(requested_times(request))
+    model: PiecewiseLinearOscillator = system.models["history"].build(values)
+    given = [values[system.role(role)] for role in _STARTS]
+    shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in (*vars(model).values(), *given)))
+    scaled, unit = to_scaled_length(model)
+    u0, v0 = (jnp.broadcast_to(jnp.asarray(x, float) / unit, shape or (1,)) for x in given)
+    u, v, events, stuck = timed_motion(scaled, u0, v0, times, request.options["most_events"])
+    finite = jnp.all(jnp.isfinite(u), axis=0)
+    outcome = jnp.where(stuck, Outcome.STEP_LIMIT, jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE))
+    names = tuple(c.name for c in system.state)
+    results = dict(zip(names, (u * unit, v * unit), strict=True))
+    results["acceleration"] = model.field(times[:, None], jnp.stack([u * unit, v * unit]))[1]
+    results |= {"event_time": events.time, "event_flank": events.flank, "event_velocity": events.velocity * unit}
+    results |= {"event_count": events.number, "outcome": outcome.astype(jnp.int8)}
+    wanted = finite_results({name: results[name] for name in (*request.outputs, "outcome")}, gaps=_EVENTS)
+    return {name: x.reshape(*x.shape[:-1], *shape) for name, x in wanted.items()}
+
+
+def averaged_flow(
+    model: PiecewiseLinearOscillator, fit_range: Array | None, u0: Array, v0: Array
+) -> tuple[Flow, Array]:
+    """The flow of ``(Re z, Im z)`` from the state ``(u0, v0)``, and w0.
+
+    Without ``fit_range`` the range of the fit is the self-consistent one, the peak amplitude.
+    """
+    reach = self_consistent_range(model, ()) if fit_range is None else fit_range
+    slow = slow_flow(model, cubic_fit(model, reach))
+    drive, detuning = jnp.sign(model.B1) * slow.drive, model.omega - slow.frequency
+
+    def field(_: Any, y: Any) -> tuple[Any, Any]:
+        real, imaginary = y
+        drift = detuning - slow.bend * (real**2 + imaginary**2)
+        return -slow.decay * real - drift * imaginary, drift * real - slow.decay * imaginary + drive
+
+    return Flow(field, (u0, v0 / slow.frequency), model.period), slow.frequency
+
+
+def _averaged(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
+    """The requested results of one point."""
+    model: PiecewiseLinearOscillator = system.models["history"].build(values)
+    model.check_method(model.damps_play, request.method)
+    u0, v0 = (jnp.asarray(values[system.role(role)], float) for role in _STARTS)
+    scaled, unit = to_scaled_length(model)
+    given = request.options["fit_range"]
+    flow, frequency = averaged_flow(scaled, jnp.asarray(given / unit) if given > 0 else None, u0 / unit, v0 / unit)
+    found = integrated(flow, request)
+    real, imaginary = found.states.T * unit
+    turned = model.omega * jnp.asarray(requested_times(request))
+    cosine, sine = jnp.cos(turned), jnp.sin(turned)
+    u, v = real * cosine + imaginary * sine, frequency * (imaginary * cosine - real * sine)
+    results = dict(zip((c.name for c in system.state), (u, v), strict=True))
+    results |= {"amplitude": jnp.hypot(real, imaginary), "phase": jnp.arctan2(imaginary, real)}
+    return finite_results({name: results[name] for name in request.outputs} | {"outcome": _outcome(flow, found)})
 
 
 def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """All requested results of one point; ``effort`` only orders the batches, as the integration is adaptive."""
     flow: Flow = system.models["history"].build(values)
     found = integrated(flow, request)
-    states, error = found.states, found.error
-    outcome = jnp.where(found.excess <= 1, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
-    failed = jnp.where(has_finite_start(flow), Outcome.STEP_LIMIT, Outcome.NOT_FINITE)
-    outcome = jnp.where(found.healthy, outcome, failed)
     scale = jnp.stack([jnp.asarray(s, float) for s in flow.scale or (1.0,) * flow.size])
-    results = _by_component(system, scale * states, "") | _by_component(system, scale * error, "_error")
-    return {name: results[name] for name in request.outputs} | {"outcome": outcome.astype(jnp.int8)}
+    results = _by_component(system, scale * found.states, "") | _by_component(system, scale * found.error, "_error")
+    return {name: results[name] for name in request.outputs} | {"outcome": _outcome(flow, found)}
 
 
 def _by_component(system: type[System], values: Array, suffix: str) -> dict[str, Array]:
@@ -61,24 +304,32 @@ def _by_component(system: type[System], values: Array, suffix: str) -> dict[str,
     }
 
 
-def _effort(system: type[System], request: Request, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Predicted segments, shape (N,): strobes and requested times; infinite beyond the limit."""
+def _effort(system: type[System], request: Request, most: float, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Predicted segments, shape (N,): strobes or periods, and requested times; infinite beyond ``most`` strobes."""
     times = requested_times(request)
-    size = None if system.state_axis else len(system.state)
-    strobes = times[-1] / predicted(_period, (system.models["history"].build, size), columns)
-    return np.where(strobes <= limits_of(request).strobes, np.ceil(strobes) + len(times), np.inf)
+    strobes = times[-1] / predicted(_period, (system.models["history"].build, system), columns)
+    return np.where(strobes <= most, np.ceil(strobes) + len(times), np.inf)
 
 
-def _period(build: Callable[..., Flow], size: int | None, values: Mapping[str, Any]) -> Array:
-    flow = build(values)
-    if size not in (None, flow.size):
+def _period(
+    build: Callable[..., Flow | PiecewiseLinearOscillator], system: type[System], values: Mapping[str, Any]
+) -> Array:
+    flow, size = build(values), len(system.state)
+    if isinstance(flow, Flow) and not system.state_axis and size != flow.size:
         raise InputError(f"system: its flow has {flow.size} components; allowed is one for each of its state, {size}")
     return jnp.asarray(flow.period)
 
 
+def _outcome(flow: Flow, found: History) -> Array:
+    """The outcome of the integration of ``flow``, int8."""
+    outcome = jnp.where(found.excess <= 1, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
+    failed = jnp.where(has_finite_start(flow), Outcome.STEP_LIMIT, Outcome.NOT_FINITE)
+    return jnp.where(found.healthy, outcome, failed).astype(jnp.int8)
+
+
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     name = f"diffrax: {request.options['solver']}"
-    solve, effort = partial(_solve, system, request), partial(_effort, system, request)
+    solve, effort = partial(_solve, system, request), partial(_effort, system, request, limits_of(request).strobes)
     return (Solver(name, over_lanes(solve), effort, chunk=16, march=True, lengthy=True),)
 
 
@@ -92,18 +343,16 @@ def _of_system(system: type[System]) -> dict[str, Any]:
     names = tuple(c.name for c in system.state)
     # An oscillator with play is no flow.
     if system.models["history"].returns is PiecewiseLinearOscillator:
-        shared = tuple(
-            o for o in ANALYSIS.options if o.name in {o for used in piecewise.METHODS.values() for o in used}
-        )
+        shared = tuple(o for o in ANALYSIS.options if o.name in {o for used in _PLAY_METHODS.values() for o in used})
         return {
-            "variables": piecewise.variables(system),
+            "variables": _play_variables(system),
             "default_outputs": names,
-            "methods": piecewise.METHODS,
-            "method_titles": piecewise.TITLES,
-            "options": (*shared, *piecewise.OPTIONS),
-            "solvers": piecewise.solvers,
-            "dimensions": piecewise.dimensions,
-            "derivatives": piecewise.derivatives,
+            "methods": _PLAY_METHODS,
+            "method_titles": _PLAY_TITLES,
+            "options": (*shared, *_PLAY_OPTIONS),
+            "solvers": _play_solvers,
+            "dimensions": _play_dimensions,
+            "derivatives": _play_derivatives,
         }
     dims = ("time",) if system.state_axis is None else ("time", system.state_axis.name)
     values = tuple(Variable(c.name, c.units, c.long_name, dims) for c in system.state)

@@ -115,7 +115,7 @@ class _Place(NamedTuple):
     healthy: Array
 
 
-class _Found(NamedTuple):
+class History(NamedTuple):
     """States (T, n) by ``steps`` of ``tolerance``, their estimated ``error``, and the ratio ``excess`` of the largest error
     to the allowed error."""
 
@@ -257,7 +257,7 @@ def trajectory(
     return states, place.reached, place.healthy, place.steps
 
 
-def _twice(flow: Flow, times: Array, tolerance: Array, attempts: Array, request: Request) -> _Found:
+def _twice(flow: Flow, times: Array, tolerance: Array, attempts: Array, request: Request) -> History:
     """The states at ``times``, and as their error the difference from a run at ``_COARSER`` times the tolerance."""
     solver, limits = getattr(diffrax, request.options["solver"])(), limits_of(request)
     settings = tolerance * jnp.array([1.0, _COARSER]), _PART**attempts * jnp.array([_PART, 1.0])
@@ -272,23 +272,23 @@ def _twice(flow: Flow, times: Array, tolerance: Array, attempts: Array, request:
     error = jnp.abs(runs[0] - runs[1])
     largest = jnp.max(error)
     excess = jnp.where(largest == 0, 0.0, largest / (request.options["rtol"] * reached[0]))
-    return _Found(tolerance, runs[0], error, excess, healthy[0], attempts + jnp.int8(1), steps[0])
+    return History(tolerance, runs[0], error, excess, healthy[0], attempts + jnp.int8(1), steps[0])
 
 
-def integrated(flow: Flow, request: Request) -> _Found:
+def integrated(flow: Flow, request: Request) -> History:
     """States and errors at the requested times, from tighter runs if the first ones miss ``rtol``."""
     times = jnp.asarray(requested_times(request))
     limits = limits_of(request)
 
-    def sharper(found: _Found) -> Array:
+    def sharper(found: History) -> Array:
         return found.tolerance * _RESERVE / found.excess
 
-    def missed(found: _Found) -> Array:
+    def missed(found: History) -> Array:
         hopeful = (found.excess > 1) & (sharper(found) >= _SHARPEST_AGAIN) & (found.attempts < _MOST_ATTEMPTS)
         hopeful &= found.steps <= _REPEATABLE * limits.steps
         return (found.attempts == 0) | (found.healthy & hopeful)
 
-    def attempt(found: _Found) -> _Found:
+    def attempt(found: History) -> History:
         first = found.attempts == 0
         tolerance = jnp.where(missed(found) & ~first, sharper(found), found.tolerance)
         new = _twice(flow, times, tolerance, found.attempts, request)
@@ -298,5 +298,5 @@ def integrated(flow: Flow, request: Request) -> _Found:
 
     nothing = jnp.full((len(times), flow.size), jnp.nan)
     tolerance = jnp.asarray(max(_SHARPNESS * request.options["rtol"], _SHARPEST))
-    start = _Found(tolerance, nothing, nothing, jnp.asarray(jnp.nan), jnp.bool_(False), jnp.int8(0), jnp.int64(0))
+    start = History(tolerance, nothing, nothing, jnp.asarray(jnp.nan), jnp.bool_(False), jnp.int8(0), jnp.int64(0))
     return jax.lax.while_loop(missed, attempt, start)
