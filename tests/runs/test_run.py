@@ -538,7 +538,7 @@ from drivetrain_jax.runs import assemble, job
 from drivetrain_jax.runs.run import run_to_file
 
 # As if the sweep were as many times larger.
-plan._SECONDS, plan._MOST_POINTS, plan._PIECE, assemble._RESIDENT = 2, 1 << 13, 1 << 12, 1 << 20
+job._SECONDS, job._MOST_POINTS, job._PIECE, assemble._RESIDENT = 2, 1 << 13, 1 << 12, 1 << 20
 
 def peak():
     return int(next(l for l in Path("/proc/self/status").read_text().splitlines() if l.startswith("VmRSS")).split()[1])
