@@ -93,7 +93,7 @@ def compute(scene: Path, folder: Path) -> Path:
 
 def draw(item: Item, results: Sequence[Path], figure: Path) -> None:
     """Write the figure unless it is newer than its results and the drawing code."""
-    code = [*PACKAGE.glob("view/*.py"), *PACKAGE.glob("analysis/*/figure.py"), Path(__file__)]
+    code = [*PACKAGE.glob("view/*.py"), Path(__file__)]
     if any(tomllib.loads(scene.read_text())["analysis"] == "atlas" for scene in item.scenes):
         code += [*PACKAGE.glob("atlas/*.py"), PACKAGE / "runs" / "atlas_chart.py"]
     newest = max(path.stat().st_mtime for path in (*results, *code))

@@ -105,6 +105,10 @@ class Declared:
     fields: tuple[str, ...] = ()
     #: Variables whose lines have a logarithmic scale.
     logarithmic: tuple[str, ...] = ()
+    #: Dots in place of lines, for results that jump between branches.
+    dots: bool = False
+    #: Module and function of ``view`` that draws what lines and maps cannot; None from it asks for these.
+    figure: str = ""
     #: Predicted resonances in figures: ``all``, only those that the forcing excites (``forced``), or none.
     predicted: str = ""
     #: Results by several methods may share a figure.
@@ -226,10 +230,10 @@ BUILT_IN = {
         logarithmic=("amplitude", "orbit_amplitude", "condition"),
         predicted="forced",
     ),
-    "history": Declared(),
+    "history": Declared(figure="motions.history"),
     "parameters": Declared(),
     "phasing": Declared(),
-    "harmonic_response": Declared(),
+    "harmonic_response": Declared(figure="responses.harmonic_response"),
     "steady_state": Declared(
         (
             *MOTION,
@@ -240,6 +244,17 @@ BUILT_IN = {
         # NaN is allowed: a motion that never repeats has no multipliers, a motion at rest has no phase, and a spectral
         # radius that underflows has no exponent.
         gaps=("phase", "spectral_radius", "floquet_multiplier", "lyapunov_exponent", "state_error"),
+        panels=(
+            ("u_max", "u_min"),
+            ("period_multiple",),
+            ("spectral_radius",),
+            ("lyapunov_exponent",),
+            ("impact_velocity",),
+            ("contact_fraction",),
+        ),
+        fields=("regime", "u_max"),
+        dots=True,
+        figure="motions.steady_state",
         predicted="all",
     ),
     "frequency_response": Declared(
@@ -274,6 +289,7 @@ BUILT_IN = {
             "state_error",
         ),
         kept=("fit_range",),
+        figure="responses.frequency_response",
         predicted="forced",
         overlaid=True,
     ),
@@ -286,6 +302,7 @@ BUILT_IN = {
         # NaN is allowed: results hold up to eight attractors, and most points have fewer.
         gaps=("basin_fraction", "basin_error", "attractor_u_max", "attractor_u_min"),
         kept=("unsettled_fraction",),
+        figure="motions.basins",
     ),
     "lyapunov": Declared(
         (
@@ -302,11 +319,20 @@ BUILT_IN = {
             "paper_estimator",
             "chaos_k01",
         ),
+        panels=(
+            ("lyapunov_spectrum",),
+            ("paper_estimator",),
+            ("sum_rule_residual",),
+            ("chaos_k01",),
+            ("lyapunov_history",),
+        ),
+        fields=("verdict", "lyapunov_spectrum"),
     ),
     "poincare": Declared(
         (within("distinct_points", 0.0), within("chaos_k01", -1.0, 1.0)),
         # K is undefined for a short section that does not repeat.
         gaps=("chaos_k01",),
+        figure="motions.section",
     ),
     "modes": Declared(
         (
@@ -318,7 +344,8 @@ BUILT_IN = {
             within("kinetic_energy", 0.0, 1.0),
             sums_to_one("kinetic_energy", "body"),
             within("mac", 0.0, 1.0),
-        )
+        ),
+        figure="frequencies.modes",
     ),
     "critical_speeds": Declared(
         (
@@ -328,6 +355,7 @@ BUILT_IN = {
             multiple("critical_speed", 60.0, "natural_frequency"),
             within("count_certified", 0.0, 1.0),
             within("mode_shape", -1.0, 1.0),
-        )
+        ),
+        figure="frequencies.critical_speeds",
     ),
 }

@@ -232,52 +232,29 @@ def resonances(dataset: xr.Dataset) -> xr.DataArray | None:
     predicted = _predicted(str(dataset.attrs.get("system")))
     if predicted is None or is_joined(dataset):
         return None
-    # Axes given in physical data: the predictions are those along their parameters.
-    given = {name: str(c.dims[0]) for name, c in dataset.coords.items() if c.ndim == 1 and c.dims[0] != name}
-    used = (predicted.axis, *predicted.parameters)
-    given = {str(n): dim for n, dim in given.items() if n in used and dim in dataset and dim != "point"}
-    found = _along_parameters(dataset.swap_dims({dim: name for name, dim in given.items()}), predicted)
-    return None if found is None else _along_given(found, dataset, given, predicted.axis)
-
-
-def _along_given(found: xr.DataArray, dataset: xr.Dataset, given: dict[str, str], axis: str) -> xr.DataArray:
-    """``found`` along the axes of the dataset, as values of the quantity that is given in place of ``axis``."""
-    swapped = {name: dim for name, dim in given.items() if name in found.dims}
-    own = {dim: (name, dataset[dim].values, dataset[dim].attrs) for name, dim in swapped.items()}
-    found = found.assign_coords(own).swap_dims(swapped)
-    found = found.drop_vars(list(swapped))
-    if axis not in given:
-        return found
-    quantity = dataset[given[axis]]
-    order = np.argsort(dataset[axis].values)
-    known = dataset[axis].values[order], quantity.values[order]
-    # Quantity and parameter are proportional, or else known within the axis alone.
-    ratio = known[1][-1] / known[0][-1]
-    if np.allclose(known[1], ratio * known[0], rtol=1e-12, atol=0):
-        values = found.values * ratio
-    else:
-        values = np.interp(found.values, *known, left=np.nan, right=np.nan)
-    attrs = found.attrs | {"units": quantity.attrs["units"]}
-    return xr.DataArray(values, found.coords, found.dims, f"{LABELS}_{given[axis]}", attrs)
-
-
-def _along_parameters(dataset: xr.Dataset, predicted: Resonances) -> xr.DataArray | None:
+    needed, axis = set(predicted.parameters), predicted.axis
+    # The axis of every parameter that varies: its own, or that of the physical data in place of it.
+    dims = {name: str(c.dims[0]) for name, c in dataset.coords.items() if c.ndim == 1 and c.dims[0] in dataset.coords}
+    dims = {str(name): dim for name, dim in dims.items() if name in {axis, *needed} and dim != "point"}
     varied = {scene_key(coordinate).partition("[")[0] for coordinate in dataset.coords.values() if coordinate.ndim}
     known = {name: value for name, value in parameters(dataset).items() if name not in varied}
-    known |= {str(dim): dataset[dim].values for dim in dataset.dims if dim in dataset.coords}
-    needed, without = set(predicted.parameters), set(predicted.without)
-    if predicted.axis not in dataset.dims or not needed <= known.keys() or without & {*known, *dataset.coords}:
+    known |= {name: dataset[name].values for name in dims}
+    if axis not in dims or not needed <= known.keys() or {*predicted.without} & {*known, *dataset.coords}:
         return None
-    dims = [str(dim) for dim in dataset.dims if dim in needed]
-    mesh = dict(zip(dims, np.meshgrid(*(known[dim] for dim in dims), indexing="ij"), strict=True))
-    about = {"units": dataset[predicted.axis].attrs["units"], "long_name": predicted.long_name}
-    return xr.DataArray(
-        predicted.values(known | mesh),
-        {dim: dataset[dim] for dim in dims} | {LABELS: (LABELS, list(predicted.labels), {"long_name": "resonance"})},
-        [*dims, LABELS],
-        f"{LABELS}_{predicted.axis}",
-        about,
-    )
+    names = sorted(needed & dims.keys(), key=lambda name: list(dataset.dims).index(dims[name]))
+    mesh = dict(zip(names, np.meshgrid(*(known[name] for name in names), indexing="ij"), strict=True))
+    values, quantity = predicted.values(known | mesh), dataset[dims[axis]]
+    if quantity.name != axis:
+        order = np.argsort(known[axis])
+        own, shown = known[axis][order], quantity.values[order]
+        # Quantity and parameter are proportional, or else known within the axis alone.
+        ratio = shown[-1] / own[-1]
+        proportional = np.allclose(shown, ratio * own, rtol=1e-12, atol=0)
+        values = values * ratio if proportional else np.interp(values, own, shown, left=np.nan, right=np.nan)
+    coords = {dims[name]: dataset[dims[name]].variable for name in names}
+    coords[LABELS] = xr.Variable(LABELS, list(predicted.labels), {"long_name": "resonance"})
+    about = {"units": quantity.attrs["units"], "long_name": predicted.long_name}
+    return xr.DataArray(values, coords, [*coords], f"{LABELS}_{quantity.name}", about)
 
 
 def _predicted(system: str) -> Resonances | None:

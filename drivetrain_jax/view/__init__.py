@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._errors import InputError
@@ -61,10 +60,12 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     from drivetrain_jax.view.style import STYLE
 
     with rc_context(STYLE):
-        if not Path(__file__).parents[1].joinpath("analysis", analysis, "figure.py").exists():
-            return chart(prepare(dataset), record.panels, record.fields, logarithmic=record.logarithmic)
-        module = import_module(f"drivetrain_jax.analysis.{analysis}.figure")
-        return module.plot(*map(prepare, (dataset, *others)))
+        datasets, figure = [prepare(each) for each in (dataset, *others)], None
+        if record.figure:
+            module, _, name = record.figure.partition(".")
+            figure = getattr(import_module(f"drivetrain_jax.view.{module}"), name)(*datasets)
+        look = {"logarithmic": record.logarithmic, "dots": record.dots}
+        return figure or chart(datasets[0], record.panels, record.fields, **look)
 
 
 def _plugin(analysis: str) -> Callable[..., Any] | None:

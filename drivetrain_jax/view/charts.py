@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,14 +18,12 @@ from matplotlib.colors import LinearSegmentedColormap, ListedColormap, LogNorm, 
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
-from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range
 from drivetrain_jax.view import overlays
-from drivetrain_jax.view.sheet import Sheet, cell_edges, fit_axis, is_logarithmic, plain_decades, widen, write_names
+from drivetrain_jax.view.sheet import Sheet, cell_edges, fit_axis, is_logarithmic, plain_decades, widen
 from drivetrain_jax.view.style import (
     FAILED_COLOUR,
     FLAG_COLOURS,
@@ -63,8 +61,14 @@ _LEAST_RANGE = 0.01
 _WIDE = 3.0
 # Line styles of variables that share a panel, and number of points below which lines have markers.
 _DASHES, _FEW = ("-", (0, (4, 1.5)), ":"), 12
-# Variables with a band of error: the stored error and its factor.
-_BANDS = {"lyapunov_spectrum": ("lyapunov_standard_error", 3.0), "basin_fraction": ("basin_error", 1.0)}
+# Variables with a band other than their error bound: the stored error, its factor, and the name of the band.
+_BANDS = {
+    "lyapunov_spectrum": ("lyapunov_standard_error", 3.0, "three standard errors"),
+    "lyapunov_history": ("lyapunov_standard_error", 3.0, "three standard errors"),
+    "basin_fraction": ("basin_error", 1.0, "standard error"),
+}
+# Variables whose sum is the mean divergence of the flow.
+_SUMMED = ("lyapunov_spectrum", "paper_estimator")
 # Position between largest decay (-1), none (0) and largest growth (1), and colour; lightness falls monotonically. White is
 # reserved for cells without a value.
 _GROWTH_COLOURS = (
@@ -75,10 +79,6 @@ _GROWTH_COLOURS = (
     (0.5, "#b8432f"),
     (1.0, "#2d0a2b"),
 )
-# Interference diagrams: line styles of the orders; range of the axes relative to the outermost crossings, and to the highest
-# operating speed; most modes of which all orders have numbers, which stand below the line of the mode.
-_ORDER_DASHES, _SPACE, _BEYOND, _FEW_MODES = ("solid", "dashed", "dotted", "dashdot"), 1.12, 1.4, 8
-_NUMBER: dict[str, Any] = {"va": "top", "path_effects": [withStroke(linewidth=2, foreground="white")]}
 # Distance of a spectral radius from 1 that rounding can make.
 _ROUNDING = 1e-12
 
@@ -168,20 +168,21 @@ def valid(dataset: xr.Dataset, name: str) -> xr.DataArray:
     """The variable ``name`` without what failed points store: codes above the last flag for failed and pending points, NaN
     in a variable without flags."""
     variable, known = dataset[name], dataset["outcome"] < FIRST_FAILURE
-    flags = len(_flags(variable))
-    if not flags:
+    count = len(flags(variable))
+    if not count:
         return variable.where(known)
-    variable = variable.where(known, flags)
-    return variable.where(~dataset[PENDING], flags + 1) if PENDING in dataset.coords else variable
+    variable = variable.where(known, count)
+    return variable.where(~dataset[PENDING], count + 1) if PENDING in dataset.coords else variable
 
 
-def _flags(variable: xr.DataArray) -> list[str]:
+def flags(variable: xr.DataArray) -> list[str]:
+    """The meanings of the codes of a variable; empty for numbers."""
     return str(variable.attrs.get("flag_meanings", "")).split()
 
 
 def flag_scale(variable: xr.DataArray, strength: float = 1.0) -> dict[str, Any]:
     """The colours of a variable of :func:`valid` with flags; a ``strength`` below 1 mixes them with white."""
-    names = [FLAG_COLOURS.get(flag, FRAME_GREY) for flag in _flags(variable)]
+    names = variable.attrs.get("flag_colours") or [FLAG_COLOURS.get(flag, FRAME_GREY) for flag in flags(variable)]
     colours = to_rgba_array([*names, FAILED_COLOUR, PENDING_COLOUR])
     colours[:, :3] = 1 - strength * (1 - colours[:, :3])
     return {"cmap": ListedColormap(colours), "vmin": -0.5, "vmax": len(colours) - 0.5}
@@ -190,7 +191,7 @@ def flag_scale(variable: xr.DataArray, strength: float = 1.0) -> dict[str, Any]:
 def flag_entries(variable: xr.DataArray, strength: float = 1.0) -> list[Patch]:
     """Legend entries of the flags that occur in a variable of :func:`valid`; with their numbers of points, unless these are
     many."""
-    names = [*_flags(variable), FAILED, PENDING]
+    names = [*flags(variable), FAILED, PENDING]
     counts = np.bincount(variable.values.astype(int).ravel(), minlength=len(names))
     colours = flag_scale(variable, strength)["cmap"].colors
     notes = [
@@ -215,7 +216,7 @@ def draw_cells(axes: Axes, field: xr.DataArray, horizontal: str, vertical: str, 
     field = field.transpose(vertical, horizontal)
     edges = cell_edges(x), cell_edges(y)
     mesh = axes.pcolormesh(*edges, field.values, rasterized=True, **options)
-    if PENDING in field.coords and not _flags(field):
+    if PENDING in field.coords and not flags(field):
         waiting = np.where(field[PENDING].values, 0.0, np.nan)
         axes.pcolormesh(*edges, waiting, cmap=ListedColormap([PENDING_COLOUR]), rasterized=True)
     fit_axis(axes, "x", x)
@@ -248,21 +249,28 @@ class Growth(NamedTuple):
 
     def of(self, radius: xr.DataArray) -> Any:
         """The growth that a spectral radius means; a radius of 0 is infinite decay."""
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             return np.log(radius) * self.factor
 
 
 def growth_of(dataset: xr.Dataset) -> Growth:
     """The growth of small disturbances in ``dataset``, in the most useful unit that its parameters allow: per second where
     the speed is known, per turn of the shaft, else per period."""
-    periods, speed = dataset.attrs.get("periods_per_turn", 0), role(dataset, "speed")
-    axis = dataset.coords.get(speed)
-    turns = None if axis is None else size(str(axis.attrs.get("units", "1")), "rps")
-    if periods and axis is not None and turns is not None:
-        return Growth(axis * turns * periods, "rate of growth [1/s]", 1e-3, 1e2)
+    periods, turns = dataset.attrs.get("periods_per_turn", 0), turns_per_second(dataset)
+    if periods and turns is not None:
+        return Growth(turns * periods, "rate of growth [1/s]", 1e-3, 1e2)
     if periods:
         return Growth(float(periods), "growth per turn, ln(factor)", 1e-6, 1e1)
     return Growth(1 / np.log(10), "$\\log_{10}$ of the spectral radius", 1e-6, 1.0)
+
+
+def turns_per_second(dataset: xr.Dataset) -> xr.DataArray | float | None:
+    """The speed of the shaft along its axis, or that of the physical data; None if it has no unit."""
+    axis = dataset.coords.get(role(dataset, "speed"))
+    data = json.loads(dataset.attrs.get("physical_data", "{}")).values()
+    speeds = [(axis, str(axis.attrs.get("units", "1")))] if axis is not None else []
+    speeds += [(entry["value"], entry.get("units", "1")) for entry in data]
+    return next((value * factor for value, units in speeds if (factor := size(units, "rps"))), None)
 
 
 def _is_radius(name: object) -> bool:
@@ -273,7 +281,7 @@ def colours(field: xr.DataArray, growth: Growth | None = None) -> tuple[dict[str
     """Options of the cells and of the colour bar for the values of ``field``: the colours of flags; those of ``growth``,
     which change at the limit of stability; or darker ones for larger values, logarithmic if positive values (and zeros)
     differ widely."""
-    if _flags(field):
+    if flags(field):
         return flag_scale(field), {}
     values = field.values[np.isfinite(field.values) | (growth is not None)]
     if growth is None:
@@ -314,7 +322,7 @@ def chart(
     if names == ["point"]:
         if len(varying_parameters(dataset)) > 1 and _flagged(dataset):
             return _scatter(dataset)
-        dataset, look = along_points(dataset), {"marker": "o", "markersize": 3} | look
+        dataset = along_points(dataset)
         names = sweep_axes(dataset)
     if len(names) > 1:
         return _small_multiples(dataset, [key for keys in stored for key in keys])
@@ -322,7 +330,8 @@ def chart(
     if not names and not long:
         return _table(dataset)
     along = (names or long)[0]
-    shown = [keys for keys in stored if all(along in dataset[key].dims for key in keys)][:_MOST_PANELS]
+    lines = [keys for keys in stored if all(along in dataset[key].dims and dataset[key].ndim < 3 for key in keys)]
+    shown = lines[:_MOST_PANELS]
     left_out = f"{len(shown)} of {len(stored)} results shown" if len(shown) < len(stored) else ""
     return stack(dataset, along, shown, **look).finish(dataset, left_out)
 
@@ -374,29 +383,25 @@ def table_rows(dataset: xr.Dataset, digits: str = ".6g") -> list[tuple[str, str,
     rows = []
     for name in results(dataset):
         variable, units = dataset[name], units_of(dataset[name])
-        label, flags = str(variable.attrs.get("long_name", name)), _flags(variable)
+        label, words = str(variable.attrs.get("long_name", name)), flags(variable)
         for place in np.ndindex(variable.shape):
             entry = variable[place]
             own = [
                 f", {dim} {entry[dim].item() if dim in entry.coords else k}"
                 for dim, k in zip(variable.dims, place, strict=True)
             ]
-            value = flags[int(entry)].replace("_", " ") if flags else f"{entry.item():{digits}}"
+            value = words[int(entry)].replace("_", " ") if words else f"{entry.item():{digits}}"
             rows.append((label + "".join(own), value, "" if units == "1" else units))
     return rows
 
 
 def _scatter(dataset: xr.Dataset) -> Figure:
-    """Points over the first parameters that vary, with the colours and markers of their flags."""
+    """Points over the first parameters that vary, in the colours of their flags."""
     horizontal, vertical, *_ = horizontal_first(dataset, varying_parameters(dataset))
     codes, sheet = valid(dataset, _flagged(dataset)), Sheet(height=3.4)
-    markers = dict(zip([*_flags(codes), FAILED, PENDING], [*"ooD^s"[: len(_flags(codes))], "x", "."], strict=True))
-    numbers = np.unique(codes.values).astype(int)
-    for entry, number in zip(flag_entries(codes), numbers, strict=True):
-        marker, chosen = list(markers.values())[number], dataset.isel(point=codes.values == number)
-        look: dict[str, Any] = {"s": 22, "marker": marker, "label": entry.get_label(), "color": entry.get_facecolor()}
-        look |= {"edgecolors": FRAME_GREY, "linewidths": 0.8} if marker not in "x." else {}
-        sheet.add(sheet.axes[0, 0].scatter(chosen[horizontal], chosen[vertical], **look))
+    look: dict[str, Any] = {"s": 24, "edgecolors": FRAME_GREY, "linewidths": 0.8} | flag_scale(codes)
+    sheet.axes[0, 0].scatter(dataset[horizontal], dataset[vertical], c=codes, **look)
+    sheet.add(*flag_entries(codes))
     sheet.label(axis_label(dataset[horizontal]), axis_label(dataset[vertical]))
     return sheet.finish(dataset)
 
@@ -457,14 +462,14 @@ def maps(
         values = np.concatenate([field.values.ravel() for k in numbers for field in fields[k]])
         whole = xr.DataArray(values, attrs=fields[numbers[0]][0].attrs)
         scales[name] = colours(whole, growth_of(rows[0][1][0]) if _is_radius(name) else None)
-        sheet.add(*(flag_entries(whole) if _flags(whole) else ()))
+        sheet.add(*(flag_entries(whole) if flags(whole) else ()))
     single, titles, meshes = sheet.axes.size == len(rows), [""] * len(rows[0][1]), {}
     for k, (row, (name, parts)) in enumerate(zip(fields, rows, strict=True)):
         above, options = titles, scales[name][0]
         coordinates = [[part[n] for n in titled if n in part.coords and not part[n].ndim] for part in parts]
         titles = [", ".join(map(_entry_text, entries)) for entries in coordinates]
         for j, (axes, field, part) in enumerate(zip(sheet.axes[k], row, parts, strict=True)):
-            flagged = bool(_flags(field))
+            flagged = bool(flags(field))
             if not flagged:
                 meshes[name] = draw_cells(
                     axes, field.clip(options["norm"].vmin, options["norm"].vmax), *names, **options
@@ -513,10 +518,10 @@ def own_dimension(dataset: xr.Dataset, name: str) -> str:
 
 
 def split(parts: Sequence[xr.Dataset], name: str) -> list[tuple[str, list[xr.Dataset]]]:
-    """Rows of :func:`maps` for every entry of the variable's own dimension."""
+    """Rows of :func:`maps` for every entry of the variable's own dimension; without labels for the first, the largest."""
     own = own_dimension(parts[0], name)
-    entries = range(parts[0].sizes[own]) if own else ()
-    numbered = [part if own in part.coords else part.assign_coords({own: entries}) for part in parts if own]
+    entries = range(parts[0].sizes[own] if own in parts[0].coords else 1) if own else ()
+    numbered = [part.assign_coords({own: range(part.sizes[own])} | dict(part.coords)) for part in parts if own]
     return [(name, [part.isel({own: k}) for part in numbered]) for k in entries] or [(name, list(parts))]
 
 
@@ -528,7 +533,9 @@ def _entry_text(coordinate: xr.DataArray) -> str:
 
 
 def entry_name(dimension: str, entry: object) -> str:
-    """``driving shaft`` for a named entry of a dimension, ``shaft 1`` for a numbered one."""
+    """``driving shaft`` for a named entry of a dimension, ``shaft 1`` for a numbered one, ``carrier`` for a body."""
+    if dimension == "body":
+        return str(entry)
     return f"{entry} {dimension}" if isinstance(entry, str) else f"{dimension} {entry}"
 
 
@@ -556,11 +563,13 @@ def stack(
 
     Flags (verdict, regime, failed and pending points) are bands behind the lines. ``look`` goes to :func:`draw_lines`.
     """
-    sheet = Sheet(len(panels), height=max(2.1, 3.0 / len(panels)), sharey=False)
+    sheet = Sheet(len(panels), height=max(1.7, 3.0 / len(panels) ** 0.5), sharey=False)
     labels = [
         draw_lines(sheet, axes, dataset, along, keys, **look) for (axes,), keys in zip(sheet.axes, panels, strict=True)
     ]
     sheet.label(axis_label(dataset[along]), *labels)
+    for (axes,), keys in zip(sheet.axes, panels, strict=True):
+        sheet.add(*(draw_flanks(dataset, axes) if "u_max" in keys else ()))
     fit_panels(sheet, dataset, along)
     if along in dataset["outcome"].dims:
         codes = valid(dataset, name) if (name := _flagged(dataset)) else computed(dataset)
@@ -588,21 +597,25 @@ def draw_lines(
     logarithmic: Sequence[str] = (),
     colours: Sequence[Any] = LINE_COLOURS,
     named: bool = True,
-    **style: Any,
+    dots: bool = False,
+    wider: bool = False,
 ) -> str:
     """Draw variables over the axis ``along``, a line for each entry of a variable's own dimension; returns the label.
 
     A spectral radius becomes growth, or its distance from 1, on a logarithmic scale on both sides of the limit of
     stability. Stored errors become bands. A scale is ``logarithmic`` for the keys named, if there are positive values.
-    Unless ``named``, the lines are not in the legend. ``style`` goes to :meth:`matplotlib.axes.Axes.plot`.
+    Unless ``named``, the lines are not in the legend. ``dots`` stand for lines that jump between branches. Each line
+    is ``wider`` than the next where some are equal.
     """
     titles = [str(dataset[key].attrs.get("long_name", key)).replace(",", "").split() for key in keys]
     x, common = dataset[along].values, [word for word in titles[0] if all(word in title for title in titles)]
-    if len(x) < _FEW:
-        style = {"marker": "o", "markersize": 3} | style
+    style: dict[str, Any] = {"marker": "o", "markersize": 2.5} if dots or len(x) < _FEW else {}
+    style |= {"linestyle": ""} if dots else {}
     label = ""
     for number, key in enumerate(keys):
-        values, label, error = _scaled(dataset, valid(dataset, key))
+        known = valid(dataset, key)
+        values, label = _scaled(dataset, key, known)
+        bound, factor, name = _BANDS.get(key, (f"{key}_error", 1.0, "error bound"))
         if _is_radius(key):
             # Logarithmic on both sides of the limit 0, linear below the smallest values: 1 - 1e-5 differs from 1.
             distance = np.abs(values.values[np.isfinite(values.values) & (values.values != 0)])
@@ -615,12 +628,17 @@ def draw_lines(
             names += [" ".join(word for word in titles[number] if word not in common)] if len(keys) > 1 else []
             look: dict[str, Any] = {"color": colours[(k if own else number) % len(colours)], "label": ", ".join(names)}
             look |= {"linestyle": _DASHES[number if own else 0]} | style
+            look |= {"linewidth": 0.9 + 0.6 * (values.sizes[own] - 1 - k)} if wider and own else {}
             drawn = axes.plot(x, line, **look)
             sheet.add(*(drawn if names and named else ()))
-            if error is not None:
-                half = error.isel({own: k}) if own else error
-                axes.fill_between(x, line - half, line + half, color=look["color"], alpha=0.25, linewidth=0)
-        if _is_radius(key) or key == "lyapunov_exponent":
+            if bound in dataset:
+                ends = [_scaled(dataset, key, known + side * factor * dataset[bound])[0] for side in (-1, 1)]
+                low, high = (end.isel({own: k}) if own else end for end in ends)
+                band = {"color": look["color"], "alpha": 0.25, "linewidth": 0, "label": name}
+                sheet.add(axes.fill_between(x, low, high, **band))
+        if key in _SUMMED:
+            sheet.add(*axes.plot(x, values.sum(own, skipna=False), color=FRAME_GREY, linestyle="--", label="sum"))
+        if _is_radius(key) or key.startswith("lyapunov"):
             sheet.add(axes.axhline(0, label="limit of stability", **LIMIT))
         if dataset[key].dtype.kind in "iu":
             axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
@@ -633,28 +651,12 @@ def draw_lines(
     return label if len(keys) == 1 else f"{' '.join(common)}{in_brackets(units_of(dataset[keys[0]]))}"
 
 
-def _scaled(dataset: xr.Dataset, values: xr.DataArray) -> tuple[xr.DataArray, str, xr.DataArray | None]:
-    """The values that a panel shows, their label, and half the width of their band of error, if stored.
-
-    A spectral radius is shown as growth per second, or as its excess over 1.
-    """
-    name, factor = _BANDS.get(str(values.name), (f"{values.name}_error", 1.0))
-    label, growth = variable_label(values), growth_of(dataset)
-    if _is_radius(values.name) and growth.label.endswith("[1/s]"):
-        # The derivative of the logarithm is 1 near the limit of stability.
-        values, label, factor = growth.of(values), growth.label, growth.factor
-    elif _is_radius(values.name):
-        values, label = values - 1, f"{label} minus 1"
-    return values, label, dataset[name] * factor if name in dataset else None
-
-
-def draw_sum(sheet: Sheet, axes: Axes, variable: xr.DataArray, along: str) -> None:
-    """Draw the sum over the variable's own dimension; a constant one, which may lie far below, only into the legend."""
-    total = variable.transpose(along, ...).values.sum(axis=-1)
-    constant = np.ptp(total) < 1e-3 * np.abs(total).max()
-    text = f"sum {total.mean():.4g}{' ' + units_of(variable) if units_of(variable) != '1' else ''} throughout"
-    line = ([], []) if constant else (variable[along], total)
-    sheet.add(*axes.plot(*line, color=FRAME_GREY, linestyle="--", label=text if constant else "sum"))
+def _scaled(dataset: xr.Dataset, name: str, values: xr.DataArray) -> tuple[xr.DataArray, str]:
+    """The values that a panel shows, and their label: a spectral radius as growth per second, or as its excess over 1."""
+    growth, label = growth_of(dataset), variable_label(dataset[name])
+    if not _is_radius(name):
+        return values, label
+    return (growth.of(values), growth.label) if growth.label.endswith("[1/s]") else (values - 1, f"{label} minus 1")
 
 
 def half_play(dataset: xr.Dataset) -> float | None:
@@ -677,45 +679,3 @@ def draw_flanks(dataset: xr.Dataset, along: Axes, portrait: Axes | None = None) 
         for side in (half, -half):
             axes.axvline(side, **LIMIT)
     return [along.axhline(side, label="flanks", **LIMIT) for side in (half, -half)][:1]
-
-
-def interference(dataset: xr.Dataset, orders: Orders, colours: Sequence[str], kinds: Mapping[str, str]) -> Figure:
-    """Interference (Campbell) diagram of one point: natural frequencies over the speed of a shaft, crossed by the lines of
-    its orders; ``colours`` of its modes, and the ``kinds`` of colours for the legend.
-
-    Crossings have their speeds as numbers, of many modes only those with the first order. With an operating range only its
-    surroundings are shown. Raises :class:`InputError` without a positive frequency.
-    """
-    stored = dataset[next(name for name in FREQUENCIES if name in dataset)]
-    require_values(stored, positive=True)
-    frequency = in_hertz(stored.values, stored.attrs["units"])
-    speeds = orders.speeds(frequency)
-    operating = operating_range(json.loads(dataset.attrs.get("options", "{}")))
-    high, top = _SPACE * np.nanmax(speeds[:, 0]), frequency.max()
-    if operating:
-        high = _BEYOND * operating[1]
-        reached = max(orders.per_turn.values()) * high / 60
-        top = np.max(frequency, initial=0.0, where=frequency <= reached) or reached
-    sheet = Sheet(height=4.2)
-    axes = sheet.axes[0, 0]
-    axes.set(xlim=(0, high), ylim=(0, _SPACE * top))
-    shown = np.flatnonzero(np.isfinite(speeds[:, 0]) & (frequency < _SPACE * top))
-    axes.hlines(frequency[shown], 0, high, colors=np.array(colours)[shown], linewidth=0.9)
-    names = [str(mode) for mode in dataset["mode"].values[shown]]
-    ends = np.stack([np.full(shown.size, high), frequency[shown]], axis=-1)
-    sheet.later(partial(write_names, axes, ends, names))
-    sheet.add(*(Line2D([], [], color=colour, label=kind) for kind, colour in kinds.items()))
-    for k, ((label, times), dashes) in enumerate(zip(orders.per_turn.items(), _ORDER_DASHES, strict=False)):
-        style = {"color": "black", "linewidth": 0.9, "linestyle": dashes, "label": f"{label} ({times:g}/turn)"}
-        sheet.add(*axes.plot([0, high], [0, times * high / 60], **style))
-        met = np.stack([speeds[shown, k], frequency[shown]], axis=-1)
-        met = met[met[:, 0] <= high]
-        axes.plot(*met.T, "o", markersize=3.5, color="black", markerfacecolor="white")
-        if k == 0 or operating or shown.size <= _FEW_MODES:
-            # One number for modes of the same frequency.
-            numbers = {f"{speed:.0f}": (speed, height) for speed, height in met}
-            sheet.later(partial(write_names, axes, list(numbers.values()), list(numbers), offset=4.0, **_NUMBER))
-    if operating:
-        sheet.add(axes.axvspan(*operating, color=LINE_COLOURS[1], alpha=0.2, zorder=0, label="operating speeds"))
-    sheet.label(f"speed of the {orders.shaft} [rpm]", "natural frequency [Hz] (number of the mode at the right)")
-    return sheet.finish(dataset)

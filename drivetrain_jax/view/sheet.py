@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -22,15 +21,14 @@ from drivetrain_jax.view.style import FRAME_GREY, caption
 
 WIDTH = 7.0
 _DPI, _NOTEBOOK_DPI = 200, 100
-# Mean width of a letter, and width of the line of a legend entry, in inches.
-_LETTER, _ENTRY = 0.068, 0.45
-# Heights of a line of the title, of the caption and of the legend, and of the horizontal label with its numbers, in inches.
-_TITLE, _CAPTION, _LEGEND, _FOOT = 0.18, 0.14, 0.17, 0.45
-_LEFT, _TITLE_LETTERS, _CAPTION_LETTERS = 0.01, 80, 112
+# Mean width of a letter of a label, and height of the horizontal axis with its label, in inches.
+_LETTER, _FOOT = 0.068, 0.55
+# Letters in a line of the title, and in a line below the panels.
+_TITLE_LETTERS, _LETTERS = 80, 112
 # The place in a paper at either end of a title: it says nothing to a reader without the paper.
 _PAPER = re.compile(r"[^:]*\b(?:Figs?\.?|Tables?|section) \d[^:]*: |, (?:Figs?\.?|Tables?) \d.*$")
-# Width of a colour bar, and height that one below a panel takes with its numbers and label, in inches.
-_BAR, _BELOW = 0.16, 0.6
+# Height of a colour bar below a panel, with its numbers and label, in inches.
+_BELOW = 0.6
 # Distance of two names beside points and of two above points, and the largest shift of a name, in points.
 _SPACING, _MOST_SHIFT = (9.5, 14.5), 24
 # Distance from its point below which a name needs no line to it, in points.
@@ -92,11 +90,9 @@ class Sheet:
         self, rows: Sequence[int], mapped: ScalarMappable, label: str, options: Mapping[str, Any], below: bool = False
     ) -> None:
         """Add a colour bar to rows of panels, at the right or ``below`` them: other rows then keep the whole width."""
-        axes, size = self.axes[list(rows)].ravel().tolist(), (WIDTH if below else len(rows) * self._height)
-        place: dict[str, Any] = {"location": "bottom" if below else "right", "aspect": size / _BAR, "pad": 0.015}
-        bar = self.figure.colorbar(
-            mapped, ax=axes, fraction=_BAR / (self._height if below else WIDTH), **place, **options
-        )
+        size = WIDTH if below else len(rows) * self._height
+        place: dict[str, Any] = {"location": "bottom" if below else "right", "aspect": 6 * size, "pad": 0.015}
+        bar = self.figure.colorbar(mapped, ax=self.axes[list(rows)].ravel().tolist(), **place, **options)
         bar.set_label(_fill(label, size))
         if isinstance(mapped.norm, LogNorm):
             plain_decades(bar.ax, "x" if below else "y")
@@ -104,28 +100,27 @@ class Sheet:
         self._more += _BELOW * below
 
     def finish(self, dataset: xr.Dataset, note: str = "") -> Figure:
-        """The figure with the scene's title, the fixed parameters (and ``note``), and the legend."""
-        figure, rows = self.figure, len(self.axes)
-        title = textwrap.wrap(shown_title(dataset), _TITLE_LETTERS, break_on_hyphens=False)
-        head = caption_lines("; ".join(part for part in (caption(dataset), note) if part))
-        entries = list(self._entries.values())
-        widths = [_ENTRY + _LETTER * len(_plain(label)) for label in self._entries]
-        # The most columns that have room; matplotlib fills one after the other.
-        counts = range(len(widths), 0, -1)
-        fitting = (n for n in counts if n == 1 or sum(map(max, np.array_split(widths, n))) <= WIDTH)
-        columns = next(fitting, 1)
-        lines = math.ceil(len(widths) / columns)
-        top = _TITLE * len(title) + 0.08
-        height = rows * self._height + self._more + top + _CAPTION * len(head) + _FOOT + _LEGEND * lines
-        figure.set_figheight(height)
-        # Blank lines of the title keep the space of the caption.
-        blank = "\n" * (math.ceil(_CAPTION / _TITLE * len(head)) + bool(head))
-        if title or head:
-            text = "\n".join(title) + blank
-            figure.suptitle(text, x=_LEFT, ha="left", size=10.5, weight="bold", parse_math=False)
-        figure.text(_LEFT, 1 - top / height, "\n".join(head), va="top", size=8, color=FRAME_GREY)
-        if entries:
-            figure.legend(handles=entries, loc="outside lower left", ncols=columns, columnspacing=1.4, borderpad=0.0)
+        """The figure with the scene's title above it, and the fixed parameters (and ``note``) and the legend below."""
+        figure, entries = self.figure, list(self._entries.values())
+        text = textwrap.fill(shown_title(dataset), _TITLE_LETTERS, break_on_hyphens=False)
+        title = figure.suptitle(text, x=0.01, ha="left", weight="bold", parse_math=False)
+        # Lines end between parameters, not within one.
+        about = re.sub(r"(?<![,;]) | (?=[^\[]*\])", "\u00a0", "; ".join(filter(None, (caption(dataset), note))))
+        about = textwrap.fill(about, _LETTERS, break_long_words=False, break_on_hyphens=False)
+        look: dict[str, Any] = {
+            "loc": "outside lower left",
+            "alignment": "left",
+            "borderpad": 0.0,
+            "columnspacing": 1.4,
+        }
+        for columns in range(len(entries) or 1, 0, -1):
+            legend = figure.legend(handles=entries, ncols=columns, title=about, **look)
+            if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+                break
+            legend.remove()
+        legend.get_title().set_color(FRAME_GREY)
+        around = sum(artist.get_window_extent().height for artist in (title, legend)) / figure.dpi
+        figure.set_figheight(len(self.axes) * self._height + self._more + around + _FOOT)
         figure.align_ylabels()
         for write in self._late:
             write()
@@ -138,25 +133,11 @@ def shown_title(dataset: xr.Dataset) -> str:
     return title[:1].upper() + title[1:]
 
 
-def caption_lines(text: str) -> list[str]:
-    """``text`` in lines of the figure's width, broken only between its parts and not within a list."""
-    lines = [""]
-    for part in re.split(r"(?<=[,;]) (?![^\[]*\])", text):
-        longer = f"{lines[-1]} {part}".strip()
-        lines[-1:] = [longer] if len(_plain(longer)) <= _CAPTION_LETTERS or not lines[-1] else [lines[-1], part]
-    return lines if text else []
-
-
 def _fill(text: str, inches: float) -> str:
     """``text`` in lines of about this length; no line begins or ends with a minus sign."""
     letters = max(int(inches / _LETTER), 24)
     text = text.replace(" - ", "\u00a0-\u00a0")
     return textwrap.fill(text, letters, break_long_words=False, break_on_hyphens=False)
-
-
-def _plain(label: str) -> str:
-    """The letters of a label without formula marks."""
-    return re.sub(r"[$^_{}]|\\(?:mathrm|[a-z]+(?=[a-z]))?", "", label)
 
 
 def is_logarithmic(values: np.ndarray) -> bool:

@@ -46,7 +46,10 @@ def lyapunov(**sizes: int) -> xr.Dataset:
 
 def test_curves_with_bands_and_verdicts():
     figure = plot(lyapunov(zeta=8))
-    assert legend(figure) == ["exponent 0", "exponent 1", "quasi periodic (7)", "chaotic (1)", "sum"]
+    assert legend(figure) == [
+        *("exponent 0", "three standard errors", "exponent 1", "sum", "limit of stability"),
+        *("quasi periodic (7)", "chaotic (1)"),
+    ]
     lines = figure.axes[0].get_lines()
     np.testing.assert_array_equal(lines[0].get_ydata()[:2], [3.0, -1.0])
 
@@ -73,7 +76,7 @@ def test_a_point_without_a_value_has_no_kind(sizes):
 
 def test_convergence_of_one_point():
     figure = plot(lyapunov())
-    assert legend(figure) == ["exponent 0", "exponent 1", "three standard errors"]
+    assert legend(figure) == ["exponent 0", "three standard errors", "exponent 1", "limit of stability"]
 
 
 def test_outputs_without_a_figure_are_named():

@@ -10,9 +10,9 @@ import xarray as xr
 from matplotlib.colors import to_hex
 
 from drivetrain_jax import InputError
-from drivetrain_jax.analysis.modes.figure import displacements, type_colours
 from drivetrain_jax.systems.planetary import coordinate_names
 from drivetrain_jax.view import plot
+from drivetrain_jax.view.frequencies import displacements, type_colours
 from tests.view.results import texts
 
 TYPES = ("rigid", "rotational", "translational", "planet", "coupled")
@@ -68,7 +68,7 @@ def test_a_coupled_branch_has_the_colour_of_its_dominant_family():
     figure, of = plot(found), type_colours(found)
     colours = [{to_hex(colour) for colour in curve.get_colors()} for curve in figure.axes[0].collections]
     assert colours == [{of["rotational"]}, {of["translational"]}]
-    assert any("dominant family" in text.get_text() for text in figure.texts)
+    assert any("dominant family" in text for text in texts(figure))
 
 
 def test_a_split_of_three_hertz_is_drawn_in_hertz():
@@ -94,7 +94,7 @@ def test_one_gear_for_every_frequency():
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
     assert titles[:3] == ["0.0 Hz, translational", "5.0 Hz ×2, translational", "10.0 Hz, translational"]
     assert len(titles) == 16
-    assert any("1 higher frequencies not drawn" in text.get_text() for text in figure.texts)
+    assert any("1 higher frequencies not drawn" in text for text in texts(figure))
 
 
 @pytest.mark.parametrize(

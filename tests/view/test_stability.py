@@ -162,8 +162,8 @@ def test_points_are_drawn_by_verdict():
         mu=("point", np.ones(6)),
     )
     figure = plot(dataset)
-    offsets = [artist.get_offsets().tolist() for artist in panels(figure)[0].collections]
-    assert offsets == [[[1, 0], [6, 5]], [[2, 1], [3, 2]], [[4, 3]], [[5, 4]]]
+    (dots,) = panels(figure)[0].collections
+    assert dots.get_offsets().tolist() == [[k + 1, k] for k in range(6)] and dots.get_array().tolist() == [*code]
     assert legend(figure) == ["stable (2)", "unstable (2)", "undecided (1)", "failed (1)"]
 
 

@@ -1,17 +1,16 @@
-"""Figures of the analysis ``frequency_response``: one line by one or several methods, branches of orbits, or maps."""
+"""Figures of responses over the frequency: sweeps by one or several methods, branches of orbits, and responses of gears."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from typing import Any
 
+import matplotlib
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import charts
@@ -27,7 +26,7 @@ from drivetrain_jax.view.style import (
     units_of,
     variable_label,
 )
-from drivetrain_jax.view.units import suitable, value_in
+from drivetrain_jax.view.units import size
 
 # Label, colour and line width of each method, from the back to the front; the exact solution is a thin line with markers.
 _METHODS = {
@@ -39,24 +38,32 @@ _METHODS = {
 }
 _DIRECTIONS, _MOST_MARKS = {"up": ">", "down": "<"}, 45
 _MARK_STYLE = {"markeredgecolor": "#111111", "markersize": 3, "fillstyle": "none", "markeredgewidth": 0.6}
-_SOLID: dict[str, Any] = {"solid_capstyle": "butt"}
-_DASHED: dict[str, Any] = {"linestyle": (0, (3, 1.6))}
-_JUMPED: dict[str, Any] = {"linewidth": 0.7, "linestyle": ":"}
-_UNSTABLE_ENTRY = Line2D([], [], color=FRAME_GREY, linewidth=1.2, **_DASHED, label="unstable")
-_JUMP_ENTRY = Line2D([], [], color=FRAME_GREY, **_JUMPED, label="jump of a sweep")
-_BACKBONE: dict[str, Any] = {"linewidth": 0.7, "linestyle": (0, (6, 2, 1, 2))}
+# Line styles of stable and unstable motions, of jumps, and of backbones; dashes are short, so that a short piece has some.
+_SOLID, _DASHED, _JUMPED, _BACKBONE = "-", (0, (2, 1)), ":", (0, (6, 2, 1, 2))
+_UNSTABLE_ENTRY = Line2D([], [], color=FRAME_GREY, linestyle=_DASHED, label="unstable")
+_JUMP_ENTRY = Line2D([], [], color=FRAME_GREY, linestyle=_JUMPED, linewidth=0.7, label="jump of a sweep")
 _SPECIAL = {"fold_frequency": ("fold", (0, (1, 2))), "doubling_frequency": ("period doubling", (0, (4, 2)))}
 _STABLE, _UNSTABLE = range(2)
 # A step of a sweep is a jump if it exceeds these ratios to the range of the values and to the neighbouring steps.
 _JUMP, _STEEPER = 0.04, 6.0
-# Margin above and below the angles of the phase; rounding tolerance of an angle.
-_ANGLE_MARGIN, _ROUNDING = 0.1, 1e-6
-_QUARTERS = ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"]
 # Relative distance below which motions next to a fold belong together.
 _NEAR = 0.15
+# Part of an angle by which rounding can make it negative.
+_ROUNDING = 1e-6
+# Bodies and coordinates of the gear by the letters in the names of the coordinates.
+_BODIES = {"c": "carrier", "r": "ring", "s": "sun"}
+_KINDS = {
+    "x": "translation $x$",
+    "y": "translation $y$",
+    "u": "rotation times base radius $u$",
+    "xi": r"radial motion $\xi$",
+    "eta": r"tangential motion $\eta$",
+}
+# Part of the largest amplitude below which an amplitude is rounding.
+_AT_REST = 1e-12
 
 
-def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
+def frequency_response(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     """Half the peak-to-peak displacement over the frequency, and the phase if stored; or maps.
 
     Each of ``dataset`` and ``others`` (results for the same parameters by other methods) may have the speed as its single
@@ -79,7 +86,7 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
             raise charts.wrong_axes(result, allowed)
         charts.require(result, "u_max", "u_min")
     _check_comparable(results)
-    return _lines(sorted(results, key=lambda result: list(_METHODS).index(_method(result))), path)
+    return _sweeps(sorted(results, key=lambda result: list(_METHODS).index(_method(result))), path)
 
 
 def _method(result: xr.Dataset) -> str:
@@ -87,15 +94,13 @@ def _method(result: xr.Dataset) -> str:
 
 
 def _check_comparable(results: list[xr.Dataset]) -> None:
-    """Raise :class:`InputError` unless all results have the same parameters, shown in the heading, and differ in the
-    legend."""
+    """Raise :class:`InputError` unless all results have the same parameters and differ in the legend."""
     first, *others = map(parameters, results)
     for other in others:
         for name in first | other:
             if first.get(name) != other.get(name):
-                raise InputError(
-                    f"{name} = {other.get(name)}: allowed is the value of the first result, {first.get(name)}"
-                )
+                allowed = f"allowed is the value of the first result, {first.get(name)}"
+                raise InputError(f"{name} = {other.get(name)}: {allowed}")
     labels = [_label(result) for result in results]
     for label in labels:
         if labels.count(label) > 1:
@@ -114,38 +119,29 @@ def _label(result: xr.Dataset) -> str:
     return label
 
 
-def _lines(results: list[xr.Dataset], path: str) -> Figure:
+def _sweeps(results: list[xr.Dataset], path: str) -> Figure:
     with_phase = all("phase" in result for result in results)
     sheet = Sheet(1 + with_phase, height=2.9, sharey=False)
-    upper, *lower = sheet.axes[:, 0]
-    lags = []
+    upper, best = sheet.axes[0, 0], results[-1]
     for result in results:
-        _, colour, width = _METHODS[_method(result)]
+        label, colour, width = _METHODS[_method(result)]
         line: dict[str, Any] = {"color": colour, "linewidth": width}
         if {"branch_u_max", "branch_u_min", "branch_stability"} <= set(result):
-            sheet.add(*_draw_saddles(upper, result, path, line))
+            _draw_saddles(sheet, result, path, line)
         for direction, mark in _DIRECTIONS.items():
-            sweep = result.sel(sweep_direction=direction)
             exact = {"marker": mark, **_MARK_STYLE} if _method(result) == "exact" else {}
             label = f"exact, {direction}" if exact else _label(result)
             sheet.add(Line2D([], [], **line, **exact, label=label))
-            sheet.add(*_draw_sweep(upper, sweep, _amplitude(sweep).values, line, exact))
-            for axes in lower:
-                # The phase [rad] modulo a turn; small negative values from rounding stay.
-                lags.append((value_in(sweep["phase"], "rad") + _ROUNDING) % (2 * np.pi) - _ROUNDING)
-                sheet.add(*_draw_sweep(axes, sweep, lags[-1], line, exact))
+            _draw_sweep(sheet, result.sel(sweep_direction=direction), path, line, exact)
     # The margin of matplotlib is a share of the range, which is small for a flat curve.
     upper.set_ylim(0, 1.03 * upper.get_ylim()[1])
     for result in results:
         _draw_special(sheet, upper, result, path)
-    best = results[-1]
     if "regime" in best:
         regime = charts.valid(best, "regime")
         for foot, direction in ((1.01, "down"), (1.055, "up")):
             charts.draw_flags(upper, regime.sel(sweep_direction=direction), path, (foot, foot + 0.035))
             place: dict[str, Any] = {"transform": upper.transAxes, "color": FRAME_GREY}
-            # A frame, because the colour of motions without separation is none.
-            upper.add_patch(Rectangle((0, foot), 1, 0.035, fill=False, linewidth=0.4, clip_on=False, **place))
             upper.text(1.005, foot + 0.0175, direction, va="center", size=6.5, **place)
         sheet.add(*charts.flag_entries(regime))
     half = charts.half_play(best)
@@ -153,16 +149,9 @@ def _lines(results: list[xr.Dataset], path: str) -> Figure:
         style = {"color": "#a8a8a8", "linewidth": 0.9, "zorder": 0.5, "label": "half the backlash"}
         sheet.add(upper.axhline(half, **style))
     fit_axis(upper, "x", np.unique(np.concatenate([result[path].values for result in results])))
-    labels = [f"half the peak-to-peak displacement{in_brackets(units_of(results[0]['u_max']))}"]
-    for axes in lower:
-        # In rad with numbers in the unit of the figure: half a turn, or a full turn for the lags of a negative drive.
-        angle, longer = units_of(results[0]["phase"]), np.nanmax(lags) > np.pi + _ANGLE_MARGIN
-        ticks = np.arange(5 if longer else 3) * np.pi / 2
-        numbers = [f"{tick * suitable('rad', [angle])[0]:g}" for tick in ticks]
-        axes.set_ylim(-_ANGLE_MARGIN, ticks[-1] + _ANGLE_MARGIN)
-        axes.set_yticks(ticks, _QUARTERS[: len(ticks)] if angle == "rad" else numbers)
-        labels.append(f"lag of the fundamental{in_brackets(angle)}")
-    sheet.label(axis_label(results[0][path]), *labels)
+    labels = [f"half the peak-to-peak displacement{in_brackets(units_of(best['u_max']))}"]
+    labels += [f"lag of the fundamental{in_brackets(units_of(best['phase']))}"] if with_phase else []
+    sheet.label(axis_label(best[path]), *labels)
     return sheet.finish(results[0])
 
 
@@ -174,7 +163,7 @@ def _wandering(result: xr.Dataset) -> xr.DataArray:
     """True where a sweep met a motion that is not periodic: it has no stability, and its extremes are dots."""
     if "regime" not in result:
         return result["u_max"].isnull() & False
-    return result["regime"] == result["regime"].attrs["flag_meanings"].split().index("non_periodic")
+    return result["regime"] == charts.flags(result["regime"]).index("non_periodic")
 
 
 def _jumps(y: np.ndarray) -> np.ndarray:
@@ -187,49 +176,46 @@ def _jumps(y: np.ndarray) -> np.ndarray:
     return (step > _JUMP * np.ptp(y[np.isfinite(y)])) & (step > _STEEPER * beside)
 
 
-def _draw_sweep(
-    axes: Axes, sweep: xr.Dataset, y: np.ndarray, line: dict[str, Any], mark: dict[str, Any]
-) -> Iterator[Line2D]:
-    """Draw a sweep: stable pieces solid, unstable ones dashed, jumps dotted; with markers for an exact one; yields legend
-    entries."""
-    path, jumps = charts.role(sweep, "speed"), np.flatnonzero(_jumps(_amplitude(sweep).values))
-    x, wandering = sweep[path].values.astype(float), _wandering(sweep).values
+def _draw_sweep(sheet: Sheet, sweep: xr.Dataset, path: str, line: dict[str, Any], mark: dict[str, Any]) -> None:
+    """Draw amplitude and phase of a sweep: stable steps solid, unstable ones dashed, jumps dotted; with a mark, if given."""
+    x, wandering, amplitude = sweep[path].values.astype(float), _wandering(sweep).values, _amplitude(sweep).values
     unstable = (sweep["stability"].values == _UNSTABLE) & ~wandering if "stability" in sweep else wandering & False
-    y, broken = np.where(wandering, np.nan, y), np.insert(x, jumps + 1, np.nan)
-    for kind, style in ((~unstable, _SOLID), (unstable, _DASHED)):
-        # One point more at either end, so that pieces of different kind meet.
-        kind = kind | np.append(kind[1:], False)
-        piece = np.insert(np.where(kind | np.append(False, kind[:-1]), y, np.nan), jumps + 1, np.nan)
-        axes.plot(broken, piece, **line, **style)
-        if style is _DASHED and kind.any():
-            # A pale line below the dashes: a short unstable piece would look like a gap.
-            axes.plot(broken, piece, **line, alpha=0.3, zorder=1.5)
-            yield _UNSTABLE_ENTRY
-    for i in jumps:
-        axes.plot(x[i : i + 2], y[i : i + 2], **(line | _JUMPED))
-        yield _JUMP_ENTRY
-    if mark:
-        every = max(len(x) // _MOST_MARKS, 1)
-        shown = slice(every // 2 if mark["marker"] == _DIRECTIONS["down"] else 0, None, every)
-        axes.plot(x[shown], y[shown], linestyle="", **mark)
+    jumps, unstable = _jumps(amplitude), unstable[:-1] | unstable[1:]
+    curves = [amplitude]
+    if len(sheet.axes) > 1:
+        # The phase modulo a turn; small negative values from rounding stay.
+        turn = 2 * np.pi * (size("rad", units_of(sweep["phase"])) or 1.0)
+        curves.append((sweep["phase"].values + _ROUNDING * turn) % turn - _ROUNDING * turn)
+    every = max(len(x) // _MOST_MARKS, 1)
+    shown = slice(every // 2 if mark.get("marker") == _DIRECTIONS["down"] else 0, None, every)
+    for (axes,), curve in zip(sheet.axes, curves, strict=True):
+        y = np.where(wandering, np.nan, curve)
+        for steps, style in ((~jumps & ~unstable, _SOLID), (~jumps & unstable, _DASHED), (jumps, _JUMPED)):
+            # A gap in place of every other step.
+            gaps = np.flatnonzero(~steps) + 1
+            thin = {"linewidth": 0.7} if style == _JUMPED else {}
+            if steps.any():
+                axes.plot(np.insert(x, gaps, np.nan), np.insert(y, gaps, np.nan), **(line | thin), linestyle=style)
+        axes.plot(x[shown], y[shown], linestyle="", **(mark or {"marker": ""}))
+    sheet.add(*[_UNSTABLE_ENTRY][: int((~jumps & unstable).any())], *[_JUMP_ENTRY][: int(jumps.any())])
 
 
-def _draw_saddles(axes: Axes, result: xr.Dataset, path: str, line: dict[str, Any]) -> Iterator[Line2D]:
-    """Draw unstable motions off the sweeps as dashed lines, one for each branch number, to the stable ones they meet; yields
-    their legend entry."""
+def _draw_saddles(sheet: Sheet, result: xr.Dataset, path: str, line: dict[str, Any]) -> None:
+    """Draw unstable motions off the sweeps as dashed lines, one for each branch number, to the stable ones they meet."""
     x, amplitude = result[path].values, _amplitude(result, "branch_").transpose(path, "branch").values
     unstable = result["branch_stability"].transpose(path, "branch").values == _UNSTABLE
     stable, saddles = np.where(unstable, np.nan, amplitude), np.where(unstable, amplitude, np.nan)
     near = _NEAR * np.nanmax(stable, initial=0.0)
     for y in saddles.T:
         for piece in np.ma.clump_unmasked(np.ma.masked_invalid(y)):
-            met = []
-            for end in (piece.start, piece.stop - 1):
-                distance = np.nan_to_num(np.abs(stable[end] - y[end]), nan=np.inf)
-                met.append(stable[end, distance.argmin()] if distance.min() < near else y[end])
-            places, values = x[piece], y[piece]
-            axes.plot([places[0], *places, places[-1]], [met[0], *values, met[1]], **line, **_DASHED)
-            yield _UNSTABLE_ENTRY
+            places = np.array([piece.start, *range(piece.start, piece.stop), piece.stop - 1])
+            values = y[places]
+            for end in (0, -1):
+                distance = np.nan_to_num(np.abs(stable[places[end]] - values[end]), nan=np.inf)
+                if distance.min() < near:
+                    values[end] = stable[places[end], distance.argmin()]
+            sheet.axes[0, 0].plot(x[places], values, **line, linestyle=_DASHED)
+            sheet.add(_UNSTABLE_ENTRY)
 
 
 def _draw_special(sheet: Sheet, axes: Axes, result: xr.Dataset, path: str) -> None:
@@ -245,8 +231,8 @@ def _draw_special(sheet: Sheet, axes: Axes, result: xr.Dataset, path: str) -> No
         # Break the line at steps larger than the height of the axes.
         gaps = np.flatnonzero(np.abs(np.diff(free)) > height) + 1
         broken = (np.insert(values.astype(float), gaps, np.nan) for values in (x, free))
-        axes.plot(*broken, **_BACKBONE, color=_METHODS[_method(result)][1], scaley=False)
-        sheet.add(Line2D([], [], **_BACKBONE, color=FRAME_GREY, label="backbone"))
+        style: dict[str, Any] = {"linewidth": 0.7, "linestyle": _BACKBONE, "color": _METHODS[_method(result)][1]}
+        sheet.add(*axes.plot(*broken, **style, scaley=False, label="backbone"))
     wandering = _amplitude(result).where(_wandering(result)).transpose(path, ...)
     if bool(wandering.notnull().any()):
         dots: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 2.0, "label": "not periodic"}
@@ -286,3 +272,34 @@ def _orbits(dataset: xr.Dataset, path: str) -> Figure:
     charts.fit_panels(sheet, dataset, path)
     sheet.label(axis_label(dataset[path]), variable_label(amplitude))
     return sheet.finish(dataset)
+
+
+def harmonic_response(dataset: xr.Dataset) -> Figure:
+    """Amplitudes of a single point over the frequency, or the largest of all coordinates over one axis and the frequency.
+
+    A panel holds the coordinates whose names begin alike (``x``, ``u``), a line for each body. Raises :class:`InputError`
+    for more than one axis, and without ``amplitude``.
+    """
+    charts.require(dataset, "amplitude")
+    charts.require_values(dataset["amplitude"], positive=True)
+    names, amplitude = charts.sweep_axes(dataset), dataset["amplitude"]
+    if len(names) > 1 or names == ["point"]:
+        raise charts.wrong_axes(dataset, "one axis, or none")
+    if names:
+        about = amplitude.attrs | {"long_name": f"largest {amplitude.attrs.get('long_name', 'amplitude')}"}
+        largest = dataset.assign(amplitude=amplitude.max("dof").assign_attrs(about))
+        return charts.maps([("amplitude", [largest])], ["frequency", names[0]], height=3.0).finish(dataset)
+    kinds, bodies = zip(*(str(dof).split("_", 1) for dof in amplitude["dof"].values), strict=True)
+    names = [_BODIES.get(body) or f"planet {body}" for body in bodies]
+    planets = [name for name in dict.fromkeys(names) if name not in _BODIES.values()]
+    # The lowest and widest lines are the lightest.
+    shades = matplotlib.colormaps["viridis_r"](np.linspace(0.05, 1.0, len(planets)))
+    colours = dict(zip(planets, shades, strict=True)) | dict(zip(_BODIES.values(), LINE_COLOURS, strict=False))
+    # The amplitude of a coordinate that does not respond is rounding.
+    known = amplitude.where(amplitude > _AT_REST * float(amplitude.max())).assign_coords(dof=names)
+    panels, shown = dataset.drop_dims("dof"), list(dict.fromkeys(kinds))
+    for kind in shown:
+        part = known.isel(dof=[k == kind for k in kinds]).reindex(dof=list(colours)).rename(dof="body")
+        panels[kind] = part.assign_attrs(long_name=_KINDS.get(kind, kind))
+    look = {"colours": list(colours.values()), "logarithmic": shown, "wider": True}
+    return charts.stack(panels, "frequency", [[kind] for kind in shown], **look).finish(dataset)

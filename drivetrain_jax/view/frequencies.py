@@ -1,0 +1,471 @@
+"""Figures of natural frequencies: curves and maps, interference diagrams, and mode shapes of shafts and planetary gears."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import cycle
+from typing import Any
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
+from matplotlib.patheffects import withStroke
+
+from drivetrain_jax._errors import InputError
+from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range, stored_orders
+from drivetrain_jax.view import charts
+from drivetrain_jax.view.sheet import Sheet, fit_axis, is_logarithmic, plain_decades, write_names
+from drivetrain_jax.view.style import (
+    FAILED_COLOUR,
+    FRAME_GREY,
+    LINE_COLOURS,
+    axis_label,
+    in_brackets,
+    parameters,
+    units_of,
+    variable_label,
+)
+from drivetrain_jax.view.units import suitable, unit_of
+
+# Colours of rigid modes, of the families in their order, and of coupled modes.
+_RIGID, _FAMILIES, _COUPLED = "#9a9a9a", ("#16324f", "#d1771e", "#3f8f5f", "#7a4fa0", "#999933"), "#a0308c"
+# Gears in a row; most mode shapes of gears and of shafts; most maps, and contours in them.
+_COLUMNS, _GEARS, _SHAFTS, _MAPS, _CONTOURS = 4, 16, 6, 4, 8
+# Ratio to the largest frequency below which a frequency is zero, which a logarithmic axis cannot show.
+_NEGLIGIBLE = 1e-6
+# Relative difference below which frequencies are one multiple frequency, with one shape drawn.
+_SAME = 1e-8
+# Relative distances at which neighbours are close, and at which they are two frequencies.
+_NEAR, _SPLIT = 0.01, 1e-6
+# Range of interference diagrams relative to the outermost crossings, and to the highest operating speed; most modes of which
+# all orders have numbers, which stand below the line of the mode.
+_SPACE, _BEYOND, _FEW_MODES = 1.12, 1.4, 8
+_NUMBER: dict[str, Any] = {"va": "top", "path_effects": [withStroke(linewidth=2, foreground="white")]}
+# Results that are drawn, the first one that is stored.
+_SPEEDS = ("critical_speed", *FREQUENCIES)
+# Line styles of the orders, and their colours in maps.
+_DASHES, _ORDER_COLOURS = ("solid", "dashed", "dotted", "dashdot"), ("black", LINE_COLOURS[1])
+_OPERATING: dict[str, Any] = {"color": LINE_COLOURS[1], "alpha": 0.2, "zorder": 0, "label": "operating speeds"}
+# Height of the shaft's segment of greatest stiffness, in units of the largest deflection; symbols of its points.
+_THICKNESS = 0.3
+_SYMBOLS: dict[str, dict[str, Any]] = {
+    "support": {"marker": "^", "markersize": 6, "markerfacecolor": "white"},
+    "mass": {"marker": "s", "markersize": 5, "markerfacecolor": FRAME_GREY},
+    "hinge": {"marker": "o", "markersize": 4, "markerfacecolor": "white"},
+}
+# Radii relative to the radius of the carrier, from the paper's base radii 77.4, 100.3, 275 and 176.8 mm.
+_SUN, _PLANET, _RING, _CARRIER = 77.4 / 176.8, 100.3 / 176.8, 275 / 176.8, 1.0
+_LARGEST = 0.28
+# Largest radius of a planet relative to half the distance of neighbours, so that planets at rest do not touch.
+_CLEAR = 0.94
+_BODIES = {"ring": "#7a7a7a", "carrier": "#2f7d4f", "sun": "#c8553d", "planet": "#1f4e79"}
+_CIRCLE = np.exp(1j * np.linspace(0, 2 * np.pi, 73))
+# Marks across the rim of the ring, whose centre is hidden.
+_MARKS = np.exp(1j * np.array([1, 5, 9]) * np.pi / 6)[:, None] * [1.0, 1.08]
+_SPOKE = np.array([0.0, 1.0])
+_REST: dict[str, Any] = {"linewidth": 0.5, "linestyle": (0, (3, 2))}
+
+
+def modes(dataset: xr.Dataset) -> Figure:
+    """Frequencies over one axis, coloured by the type of the mode, or the mode shapes of a single point.
+
+    A single point without shapes is an interference diagram, if the numbers of teeth are known.
+    Curves follow the stored ``branch``, so colours do not change where frequencies cross or veer; without it every point is
+    a dot. Zero frequencies are not visible on the logarithmic scale. Raises :class:`InputError` for more than one axis, and
+    if needed variables are not stored or have no value.
+    """
+    names = charts.sweep_axes(dataset)
+    if len(names) > 1 or names == ["point"]:
+        raise charts.wrong_axes(dataset, "one axis for a figure of frequencies, or none for mode shapes")
+    charts.require(dataset, "natural_frequency")
+    if names:
+        return _types_over(dataset, names[0])
+    orders = stored_orders(dataset.attrs)
+    if "mode_shape" in dataset or not orders:
+        return _gears(dataset)
+    types, colours = _types(dataset, dominant=True).tolist(), type_colours(dataset)
+    kinds = {kind: colour for kind, colour in colours.items() if kind in types and kind != "rigid"}
+    return _interference(dataset, orders, [colours[kind] for kind in types], kinds if "mode_type" in dataset else {})
+
+
+def type_colours(dataset: xr.Dataset) -> dict[str, str]:
+    """Colour of every type of modes by name."""
+    if "mode_type" not in dataset:
+        return {"coupled": _COUPLED}
+    rigid, *families, coupled = charts.flags(dataset["mode_type"])
+    return {rigid: _RIGID, **dict(zip(families, cycle(_FAMILIES), strict=False)), coupled: _COUPLED}
+
+
+def _types(dataset: xr.Dataset, dominant: bool = False) -> np.ndarray:
+    """Type of every mode by name, or with ``dominant`` the dominant family of a coupled mode, if stored.
+
+    All modes are coupled if the variable is missing.
+    """
+    if "mode_type" not in dataset:
+        return np.full(dataset["natural_frequency"].shape, "coupled")
+    types = np.array(charts.flags(dataset["mode_type"]))[dataset["mode_type"].values]
+    if not (dominant and "dominant_family" in dataset):
+        return types
+    families = np.array(charts.flags(dataset["dominant_family"]))
+    return np.where(types == "coupled", families[dataset["dominant_family"].values], types)
+
+
+def _types_over(dataset: xr.Dataset, name: str) -> Figure:
+    charts.require_values(dataset["natural_frequency"], positive=True)
+    dataset = dataset.transpose(name, ...)
+    x, frequency = dataset[name].values, dataset["natural_frequency"].values
+    types, colours = _types(dataset, dominant=True), type_colours(dataset)
+    close = _close(frequency)
+    sheet = Sheet(1 + bool(close), height=4.4 / (1 + bool(close)), sharey=False)
+    axes = sheet.axes[0, 0]
+    moving = np.where(frequency > _NEGLIGIBLE * np.nanmax(frequency), frequency, np.nan)
+    if "branch" in dataset:
+        order = np.argsort(dataset["branch"].values, axis=1, kind="stable")
+        branches, kinds = (np.take_along_axis(array, order, axis=1) for array in (moving, types))
+        for curve, kind in zip(branches.T, kinds.T, strict=True):
+            points = np.stack([x, curve], axis=-1)
+            # A piece between two points has the colour of its end; snapping to whole pixels would make steps.
+            look = {
+                "colors": [colours[str(k)] for k in kind[1:]],
+                "linewidths": 1.1,
+                "capstyle": "round",
+                "snap": False,
+            }
+            if np.isfinite(curve).any():
+                axes.add_collection(LineCollection([*np.stack([points[:-1], points[1:]], axis=1)], **look))
+    else:
+        for kind, colour in colours.items():
+            rows, numbers = np.nonzero(types == kind)
+            axes.plot(x[rows], moving[rows, numbers], ".", markersize=2.5, color=colour)
+    axes.set(yscale="log", ylim=(0.93 * np.nanmin(moving), 1.07 * np.nanmax(moving)))
+    plain_decades(axes, "y")
+    labels = [variable_label(dataset["natural_frequency"])]
+    if close:
+        _draw_distances(sheet, sheet.axes[1, 0], x, frequency, close)
+        units = in_brackets(units_of(dataset["natural_frequency"]))
+        labels.append(f"distance of close modes (numbers at the right){units}")
+    fit_axis(axes, "x", x)
+    sheet.label(axis_label(dataset[name]), *labels)
+    shown = [kind for kind in colours if (types[np.isfinite(moving)] == kind).any() and "mode_type" in dataset]
+    sheet.add(*(Line2D([], [], color=colours[kind], label=kind) for kind in shown))
+    mixed = "coupled" in _types(dataset) and "coupled" not in types
+    return sheet.finish(dataset, "coupled modes in the colour of their dominant family" if mixed else "")
+
+
+def _close(frequency: np.ndarray) -> list[int]:
+    """Lower modes of neighbours that come closer than 1 % somewhere, and are not one multiple frequency everywhere."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        apart = np.diff(frequency, axis=1) / frequency[:, 1:]
+    near = (np.nanmin(apart, axis=0, initial=np.inf) < _NEAR) & (np.nanmax(apart, axis=0, initial=0.0) > _SPLIT)
+    return np.flatnonzero(near & (np.nanmin(frequency, axis=0)[:-1] > 0)).tolist()
+
+
+def _draw_distances(sheet: Sheet, axes: Axes, x: np.ndarray, frequency: np.ndarray, close: list[int]) -> None:
+    """Draw the distances of neighbours: the splits and veerings that the axis of the frequencies cannot show."""
+    colours, ends = _colours(len(close)), []
+    for colour, mode in zip(colours, close, strict=True):
+        distance = frequency[:, mode + 1] - frequency[:, mode]
+        distance = np.where(distance > _SPLIT * frequency[:, mode + 1], distance, np.nan)
+        axes.plot(x, distance, color=colour, label=f"modes {mode + 1} and {mode + 2}")
+        ends.append((x[-1], distance[-1]))
+    axes.set_yscale("log")
+    plain_decades(axes, "y")
+    names = [f"{mode + 1}/{mode + 2}" for mode in close]
+    sheet.later(partial(write_names, axes, ends, names, colours=colours))
+
+
+def _colours(count: int) -> np.ndarray:
+    # The yellow end of the colour map is too light for lines on white.
+    return matplotlib.colormaps["viridis"](np.linspace(0.0, 0.75, count))
+
+
+def _gears(dataset: xr.Dataset) -> Figure:
+    """One gear for every frequency."""
+    charts.require(dataset, "mode_shape")
+    name, units = charts.role(dataset, "planets"), units_of(dataset["natural_frequency"])
+    angles, types, colours = parameters(dataset).get(name), _types(dataset), type_colours(dataset)
+    families, frequency = _types(dataset, dominant=True), dataset["natural_frequency"].values
+    if angles is None:
+        raise InputError(f"{name or 'planets'}: missing; the figure of mode shapes needs the angles of planets")
+    if not np.isfinite(frequency).all():
+        raise InputError("natural_frequency = nan: nothing to plot; the point has no result")
+    starts = np.flatnonzero(np.append(True, np.diff(frequency) > _SAME * frequency[1:]))
+    counts = np.diff(np.append(starts, frequency.size))
+    drawn, left_out = list(zip(starts, counts, strict=True))[:_GEARS], max(starts.size - _GEARS, 0)
+    digits = 1 if units == "Hz" or frequency.max() > 1e3 else 4
+    shares = {"dominant_family", "dominant_share"} <= set(dataset)
+    sheet = Sheet(-(-len(drawn) // _COLUMNS), _COLUMNS, height=1.95)
+    for axes in sheet.axes.flat:
+        axes.axis("off")
+    for axes, (mode, count) in zip(sheet.axes.flat, drawn, strict=False):
+        shape = dataset["mode_shape"].transpose("mode", "dof").values[mode]
+        _draw_gear(axes, dict(zip(dataset["dof"].values, shape, strict=True)), [float(angle) for angle in angles])
+        multiple, family = f" ×{count}" if count > 1 else "", str(families[mode])
+        named = f", {types[mode]}"
+        if types[mode] == "coupled" and shares:
+            # Truncated and not rounded to 100 %.
+            share = np.floor(1e4 * float(dataset["dominant_share"].values[mode])) / 100
+            named = f"\n{share:.2f} % {family}"
+        title = f"{frequency[mode]:.{digits}f} {units}{multiple}{named}"
+        axes.set_title(title, size=8, color=colours[family], pad=1.5)
+    sheet.add(*(Line2D([], [], color=colour, label=body) for body, colour in _BODIES.items()))
+    sheet.add(Line2D([], [], color=FRAME_GREY, **_REST, label="at rest"))
+    return sheet.finish(dataset, f"{left_out} higher frequencies not drawn" if left_out else "")
+
+
+def displacements(shape: Mapping[str, float], planets: int) -> tuple[np.ndarray, np.ndarray]:
+    """``[x, y, u]`` of carrier, ring and sun (3, 3) and ``[xi, eta, u]`` of the planets (N, 3) of one mode shape.
+
+    The largest translation or rim movement is scaled to 0.28 of the carrier's radius. Bodies without translations stay in
+    place, and the centres of the planets move with the carrier.
+    """
+    central = [[shape.get(f"x_{body}", 0.0), shape.get(f"y_{body}", 0.0), shape[f"u_{body}"]] for body in "crs"]
+    moved = [
+        [shape.get(f"xi_{i}", 0.0), shape.get(f"eta_{i}", shape["u_c"]), shape[f"u_{i}"]] for i in range(1, planets + 1)
+    ]
+    scale = _LARGEST / max(np.abs(central).max(), np.abs(moved).max(), 1e-300)
+    return scale * np.array(central), scale * np.array(moved)
+
+
+def drawn_radii(angles: Sequence[float]) -> tuple[float, float, float]:
+    """Radii of sun, planets and ring: the paper's ratio, or smaller planets where neighbours at ``angles`` would overlap."""
+    turned = np.sort(np.mod(angles, 2 * np.pi))
+    gaps = np.diff(np.append(turned, turned[0] + 2 * np.pi))
+    planet = min(_PLANET, _CLEAR * _CARRIER * np.sin(min(gaps.min(), np.pi) / 2))
+    return (_SUN, _PLANET, _RING) if planet == _PLANET else (_CARRIER - planet, planet, _CARRIER + planet)
+
+
+def _draw_gear(axes: Axes, shape: Mapping[str, float], angles: Sequence[float]) -> None:
+    """Draw the bodies at rest and displaced; marks show the rotation of each. Axes are scaled equally."""
+    (carrier, ring, sun), planets = displacements(shape, len(angles))
+    sun_radius, planet_radius, ring_radius = drawn_radii(angles)
+    spokes = np.exp(1j * np.asarray(angles))
+    # Points of the complex plane: the centre at rest, its displacement, the radius of the rim, and lines about the centre.
+    bodies = [("ring", 0, ring, ring_radius, [ring_radius * _CIRCLE, *(ring_radius * _MARKS)])]
+    bodies += [("carrier", 0, carrier, _CARRIER, [_CARRIER * spoke * _SPOKE for spoke in spokes])]
+    bodies += [("sun", 0, sun, sun_radius, [sun_radius * _CIRCLE, sun_radius * _SPOKE])]
+    for spoke, (radial, tangential, rotation) in zip(spokes, planets, strict=True):
+        local = (radial + 1j * tangential) * spoke
+        lines = [planet_radius * _CIRCLE, planet_radius * spoke * _SPOKE]
+        bodies.append(("planet", _CARRIER * spoke, (local.real, local.imag, rotation), planet_radius, lines))
+    rest, moved, colours = [], [], []
+    for name, centre, (x, y, rotation), radius, lines in bodies:
+        for line in lines:
+            displaced = centre + x + 1j * y + line * np.exp(1j * rotation / radius)
+            rest.append(np.stack([(centre + line).real, (centre + line).imag], axis=-1))
+            moved.append(np.stack([displaced.real, displaced.imag], axis=-1))
+            colours.append(_BODIES[name])
+    axes.add_collection(LineCollection(rest, colors=FRAME_GREY, **_REST))
+    axes.add_collection(LineCollection(moved, colors=colours, linewidths=1.1))
+    axes.set(aspect="equal", xlim=(-1.9, 1.9), ylim=(-1.9, 1.9))
+
+
+def critical_speeds(dataset: xr.Dataset) -> Figure:
+    """Curves of the frequencies of all modes along one axis, maps of the first modes over two axes, or the mode shapes.
+
+    Along a logarithmic axis (support stiffness) both axes are logarithmic: the critical-speed map. A list of points is
+    drawn along its first parameter. A single point without shapes is an interference diagram. Uncertified frequencies are
+    crossed. Raises :class:`InputError` for more than two axes, and if no variable that can be drawn is stored or has a
+    value.
+    """
+    names, orders = charts.sweep_axes(dataset), stored_orders(dataset.attrs)
+    if not names and "mode_shape" in dataset:
+        return _shafts(dataset)
+    shown = next((name for name in _SPEEDS if name in dataset), None)
+    if shown is None or not (names or orders):
+        stored = ", ".join(str(name) for name in dataset.data_vars)
+        needed = "an axis and one of " + ", ".join(FREQUENCIES) if names else "mode_shape, or an axis"
+        raise InputError(f"outputs = {stored}: nothing to plot; the figure needs {needed}")
+    if orders and not names:
+        return _interference(dataset, orders, _colours(dataset.sizes["mode"]), {})
+    if len(names) == 1:
+        dataset = charts.along_points(dataset) if names == ["point"] else dataset
+        return _modes_over(dataset, charts.sweep_axes(dataset)[0], shown)
+    if len(names) == 2:
+        return _maps(dataset, names, shown)
+    raise charts.wrong_axes(dataset, "one or two axes for a figure of critical speeds")
+
+
+def _modes_over(dataset: xr.Dataset, name: str, shown: str) -> Figure:
+    x, y = dataset[name].values, dataset[shown].transpose("mode", name)
+    logarithmic = is_logarithmic(x)
+    charts.require_values(y, positive=logarithmic)
+    speeds = y.where(y > _NEGLIGIBLE * y.max()) if logarithmic else y
+    colours, drawn = _colours(len(y)), speeds.values
+    sheet = charts.stack(dataset.assign({shown: speeds}), name, [[shown]], colours=colours, named=False)
+    axes = sheet.axes[0, 0]
+    axes.set_xlim(x[0], x[-1])
+    axes.set(yscale="log") if logarithmic else axes.set_ylim(bottom=0.0)
+    kept = np.isfinite(drawn).any(axis=1)
+    last = len(x) - 1 - np.isfinite(drawn[:, ::-1]).argmax(axis=1)
+    ends = np.stack([x[last], drawn[np.arange(len(drawn)), last]], axis=-1)[kept]
+    modes = [f"mode {mode}" for mode in dataset["mode"].values[kept]]
+    sheet.later(partial(write_names, axes, ends, modes, colours=colours[kept]))
+    orders = stored_orders(dataset.attrs) if shown == "critical_speed" else None
+    for (label, times), dashes in zip(orders.per_turn.items() if orders else (), _DASHES, strict=False):
+        style: dict[str, Any] = {"linestyle": dashes, "linewidth": 1.2 if times == 1 else 0.7}
+        for curve, colour in zip(drawn, colours, strict=True) if times != 1 else ():
+            axes.plot(x, curve / times, color=colour, **style)
+        sheet.add(Line2D([], [], color=FRAME_GREY, label=label, **style))
+    if operating := _operating(dataset, shown):
+        # A logarithmic axis has no zero.
+        low = operating[0] or min(axes.get_ylim()[0], operating[1] / 10)
+        sheet.add(axes.axhspan(low, operating[1], **_OPERATING))
+    if logarithmic:
+        plain_decades(axes, "y")
+    axes.grid(color=FRAME_GREY, alpha=0.2, linewidth=0.5)
+    if "count_certified" in dataset:
+        mode, place = np.nonzero((dataset["count_certified"].transpose("mode", name).values == 0) & np.isfinite(drawn))
+        style = {"color": FAILED_COLOUR, "markersize": 5, "label": "not certified by the count"}
+        sheet.add(*(axes.plot(x[place], drawn[mode, place], "x", **style) if mode.size else ()))
+    # Other parameters of a list of points that equal the first.
+    equal = [c for c in dataset.coords.values() if c.dims == (name,) and c.name not in (name, "point")]
+    equal = [str(c.name) for c in equal if np.array_equal(c.values, x)]
+    sheet.label(" = ".join([axis_label(dataset[name]), *equal]), variable_label(dataset[shown]))
+    return sheet.finish(dataset)
+
+
+def _operating(dataset: xr.Dataset, shown: str) -> tuple[float, float] | None:
+    """Lowest and highest operating speed in the units of ``shown``, if stored."""
+    rpm = suitable("rpm", [str(dataset[shown].attrs.get("units", "rpm"))])[0]
+    stored = operating_range(json.loads(dataset.attrs.get("options", "{}")))
+    return (stored[0] * rpm, stored[1] * rpm) if stored else None
+
+
+def _maps(dataset: xr.Dataset, names: list[str], shown: str) -> Figure:
+    """Maps of the first modes on one scale, with contours and the lines where an order meets the mode at the lowest or
+    highest operating speed."""
+    charts.require_values(dataset[shown], positive=True)
+    names = charts.horizontal_first(dataset, names)
+    rows = [row for row in charts.split([dataset], shown) if float(row[1][0][shown].max()) > 0][:_MAPS]
+    sheet, orders = charts.maps(rows, names, titled=["mode"]), stored_orders(dataset.attrs)
+    # A white outline keeps the lines visible on the dark end of the map.
+    style = {"linewidth": 1.0, "path_effects": [withStroke(linewidth=2.4, foreground="white")]}
+    for (axes,), (_, (part,)) in zip(sheet.axes, rows, strict=True):
+        field = part[shown].transpose(*reversed(names))
+        x, y, low, high = field[names[0]], field[names[1]], float(field.min()), float(field.max())
+        if min(field.shape) > 1 and low < high:
+            lines = axes.contour(x, y, field, _CONTOURS, colors="white", linewidths=0.5)
+            axes.clabel(lines, fontsize=6.5, fmt="%g")
+        per_turn = orders.per_turn if orders else {"": 1.0}
+        for (order, times), colour in zip(per_turn.items(), _ORDER_COLOURS, strict=False):
+            limits = zip(("lowest", "highest"), _operating(part, shown) or (), ("dashed", "solid"), strict=False)
+            for name, speed, dashes in limits:
+                if low < times * speed < high:
+                    axes.contour(x, y, field, [times * speed], colors=colour, linestyles=dashes).set(**style)
+                    label = f"{name} operating speed" + ("" if times == 1 else f", {order}")
+                    sheet.add(Line2D([], [], color=colour, linestyle=dashes, label=label, **style))
+    return sheet.finish(dataset)
+
+
+def _shafts(dataset: xr.Dataset) -> Figure:
+    count = min(dataset.sizes["mode"], _SHAFTS)
+    sheet = Sheet(count, height=1.4)
+    edges, thickness, points = _shaft(dataset)
+    x = dataset["x"].values * edges[-1]
+    for (axes,), index, colour in zip(sheet.axes, range(count), _colours(count), strict=True):
+        shape = dataset["mode_shape"].isel(mode=index).values
+        _draw_shaft(sheet, axes, edges, thickness, points)
+        axes.axhline(0.0, color=FRAME_GREY, linewidth=0.6)
+        axes.plot(x, shape, color=colour)
+        axes.fill_between(x, shape, color=colour, alpha=0.15, linewidth=0)
+        axes.set(xlim=(-0.02 * edges[-1], 1.02 * edges[-1]), ylim=(-1.25, 1.25), yticks=(-1.0, 0.0, 1.0))
+        name = next((name for name in _SPEEDS if name in dataset), None)
+        text = f"mode {dataset['mode'].values[index]}"
+        if name:
+            value = f"{dataset[name].values[index]:.5g} {units_of(dataset[name])}"
+            text += f": {dataset[name].attrs.get('long_name', name)} {value}"
+        axes.set_title(text, loc="left", pad=3, color=FRAME_GREY, size=8)
+    distance = in_brackets(unit_of(dataset, "length", "m")[1]) if thickness else ", fraction of the length"
+    sheet.label(f"distance from A{distance}", "deflection, largest 1")
+    return sheet.finish(dataset)
+
+
+def _shaft(dataset: xr.Dataset) -> tuple[list[float], list[float], dict[str, list[float]]]:
+    """Ends of the segments (in the unit of the figure), their thickness, and the places of supports, masses and hinges, from
+    the fixed parameters, axes of one value among them; without stored lengths a length of 1 without thickness."""
+    fixed = parameters(dataset)
+    if not {"length", "EI"} <= fixed.keys():
+        return [0.0, 1.0], [], {}
+    edges = [0.0, *np.cumsum(unit_of(dataset, "length", "m")[0] * np.array(fixed["length"])).tolist()]
+    joints = len(edges) - 2
+
+    def ends(name: str) -> list[float]:
+        between = fixed.get(f"{name}_joint", []) or [0.0] * joints
+        between = between if isinstance(between, list) else [between] * joints
+        return [fixed.get(f"{name}_A", 0.0), *between, fixed.get(f"{name}_D", 0.0)]
+
+    hinges = fixed.get("k_hinge", [])
+    hinges = hinges if isinstance(hinges, list) else [hinges] * joints
+    points = {
+        "support": [x for x, k in zip(edges, ends("k"), strict=True) if k > 0],
+        "mass": [x for x, *m in zip(edges, ends("m"), ends("I"), strict=True) if max(m) > 0],
+        "hinge": [x for x, k in zip(edges[1:-1], hinges, strict=False) if k < math.inf],
+    }
+    # The stiffness of a round shaft goes with the fourth power of its diameter.
+    diameters = np.asarray(fixed["EI"]) ** 0.25
+    return edges, (_THICKNESS * diameters / diameters.max()).tolist(), points
+
+
+def _draw_shaft(
+    sheet: Sheet, axes: Axes, edges: list[float], thickness: list[float], points: dict[str, list[float]]
+) -> None:
+    """Draw the segments as grey boxes about the axis, and the symbols of the points."""
+    for left, right, height in zip(edges, edges[1:], thickness, strict=False):
+        box = (left, -height / 2), right - left, height
+        axes.add_patch(Rectangle(*box, facecolor=FRAME_GREY, alpha=0.2, edgecolor="none"))
+    for name, places in points.items():
+        level = -0.45 * _THICKNESS - 0.2 if name == "support" else 0.0
+        style: dict[str, Any] = {"clip_on": False, "linestyle": "none", "color": FRAME_GREY, "label": name}
+        # An empty line that is not clipped would disturb the layout.
+        sheet.add(*(axes.plot(places, [level] * len(places), **style, **_SYMBOLS[name]) if places else ()))
+
+
+def _interference(dataset: xr.Dataset, orders: Orders, colours: Any, kinds: Mapping[str, str]) -> Figure:
+    """Interference (Campbell) diagram of one point: natural frequencies over the speed of a shaft, crossed by the lines of
+    its orders; ``colours`` of its modes, and the ``kinds`` of colours for the legend.
+
+    Crossings have their speeds as numbers, of many modes only those with the first order. With an operating range only its
+    surroundings are shown. Raises :class:`InputError` without a positive frequency.
+    """
+    stored = dataset[next(name for name in FREQUENCIES if name in dataset)]
+    charts.require_values(stored, positive=True)
+    frequency = in_hertz(stored.values, stored.attrs["units"])
+    speeds = orders.speeds(frequency)
+    operating = operating_range(json.loads(dataset.attrs.get("options", "{}")))
+    high, top = _SPACE * np.nanmax(speeds[:, 0]), frequency.max()
+    if operating:
+        high = _BEYOND * operating[1]
+        reached = max(orders.per_turn.values()) * high / 60
+        top = np.max(frequency, initial=0.0, where=frequency <= reached) or reached
+    sheet = Sheet(height=4.2)
+    axes = sheet.axes[0, 0]
+    axes.set(xlim=(0, high), ylim=(0, _SPACE * top))
+    shown = np.flatnonzero(np.isfinite(speeds[:, 0]) & (frequency < _SPACE * top))
+    axes.hlines(frequency[shown], 0, high, colors=np.array(colours)[shown], linewidth=0.9)
+    names = [str(mode) for mode in dataset["mode"].values[shown]]
+    ends = np.stack([np.full(shown.size, high), frequency[shown]], axis=-1)
+    sheet.later(partial(write_names, axes, ends, names))
+    sheet.add(*(Line2D([], [], color=colour, label=kind) for kind, colour in kinds.items()))
+    for k, ((label, times), dashes) in enumerate(zip(orders.per_turn.items(), _DASHES, strict=False)):
+        style = {"color": "black", "linewidth": 0.9, "linestyle": dashes, "label": f"{label} ({times:g}/turn)"}
+        sheet.add(*axes.plot([0, high], [0, times * high / 60], **style))
+        met = np.stack([speeds[shown, k], frequency[shown]], axis=-1)
+        met = met[met[:, 0] <= high]
+        axes.plot(*met.T, "o", markersize=3.5, color="black", markerfacecolor="white")
+        if k == 0 or operating or shown.size <= _FEW_MODES:
+            # One number for modes of the same frequency.
+            numbers = {f"{speed:.0f}": (speed, height) for speed, height in met}
+            sheet.later(partial(write_names, axes, list(numbers.values()), list(numbers), offset=4.0, **_NUMBER))
+    if operating:
+        sheet.add(axes.axvspan(*operating, **_OPERATING))
+    sheet.label(f"speed of the {orders.shaft} [rpm]", "natural frequency [Hz] (number of the mode at the right)")
+    return sheet.finish(dataset)
