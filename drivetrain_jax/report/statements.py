@@ -9,15 +9,15 @@ import json
 import math
 import re
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
 from drivetrain_jax.resonances import FREQUENCIES, operating_range, stored_orders
-from drivetrain_jax.view.charts import role
+from drivetrain_jax.view.charts import growth_of, role
 from drivetrain_jax.view.style import in_brackets, scene_key, units_of
-from drivetrain_jax.view.units import ASKED, size, suitable, unit_of, value_in, written_units
+from drivetrain_jax.view.units import ASKED, suitable, unit_of, value_in, written_units
 
 if TYPE_CHECKING:
     from drivetrain_jax.runs.reply import Limit
@@ -82,7 +82,7 @@ def _about_codes(dataset: xr.Dataset, variable: xr.DataArray, ranges: bool) -> I
 
 def _main_axis(dataset: xr.Dataset, variable: xr.DataArray) -> xr.DataArray | None:
     """The axis of the speed, or the only axis."""
-    speed = json.loads(dataset.attrs.get("roles", "{}")).get("speed")
+    speed = role(dataset, "speed")
     axes = [dataset[d] for d in variable.dims if d in dataset.coords and dataset[d].dtype.kind == "f"]
     along = {str(c.dims[0]) for n, c in dataset.coords.items() if n == speed and c.ndim == 1}
     return next((a for a in axes if a.name in along or scene_key(a) == speed), axes[0] if len(axes) == 1 else None)
@@ -129,16 +129,14 @@ def _about_growth(dataset: xr.Dataset) -> Iterator[str]:
     radius = dataset.get("spectral_radius")
     if radius is None or not periods or not np.isfinite(radius.values).any():
         return
-    turns = _turns_per_second(dataset)
-    with np.errstate(divide="ignore"):
-        rates = (np.log(radius) * periods * (1.0 if turns is None else turns)).transpose(*radius.dims)
+    growth = growth_of(dataset)
+    rates, timed = growth.of(radius).transpose(*radius.dims), growth.label.endswith("[1/s]")
     place = np.unravel_index(int(np.ma.masked_invalid(rates.values).argmax()), rates.shape)
     rate, factor = float(rates.values[place]), float(radius.values[place]) ** periods
     if rate == 0 or not math.isfinite(rate):
         return
-    per_second = "" if turns is None else f"{abs(rate):.4g} 1/s, "
-    time, turn = math.log(2) / abs(rate), math.log(2) / abs(math.log(factor))
-    seconds = "" if turns is None else f"{time:.4g} s, "
+    turns = math.log(2) / abs(math.log(factor))
+    per_second, seconds = (f"{abs(rate):.4g} 1/s, ", f"{math.log(2) / abs(rate):.4g} s, ") if timed else ("", "")
     where = f" at {text}" if (text := _place(dataset, radius, tuple(map(int, place)))) else ""
     start, most, ends = (
         ("Unstable means that a small disturbance grows", "fastest", "doubles")
@@ -146,16 +144,7 @@ def _about_growth(dataset: xr.Dataset) -> Iterator[str]:
         else ("Stable means that every small disturbance dies out", "slowest", "halves")
     )
     most = f", {most}{where}" if where else ""
-    yield f"{start}{most}: {per_second}by a factor {factor:.6g} per turn; it {ends} in {seconds}{turn:.4g} turns."
-
-
-def _turns_per_second(dataset: xr.Dataset) -> xr.DataArray | float | None:
-    """The speed of the shaft along its axis, or that of the physical data; None if it has no unit."""
-    axis = dataset.coords.get(role(dataset, "speed"))
-    given = json.loads(dataset.attrs.get("physical_data", "{}")).values()
-    known = [(axis, str(axis.attrs.get("units", "1")))] if axis is not None else []
-    known += [(entry["value"], entry.get("units", "1")) for entry in given]
-    return next((value * factor for value, units in known if (factor := size(units, "rps"))), None)
+    yield f"{start}{most}: {per_second}by a factor {factor:.6g} per turn; it {ends} in {seconds}{turns:.4g} turns."
 
 
 def _about_limit(dataset: xr.Dataset, limit: Limit) -> Iterator[str]:
@@ -269,15 +258,11 @@ def fixed_table(dataset: xr.Dataset) -> list[tuple[str, ...]]:
     return rows
 
 
-class Table(NamedTuple):
-    """A table with its ``head``."""
-
-    head: list[str]
-    rows: list[list[str]]
+Table = tuple[list[str], list[list[str]]]
 
 
 def values_tables(dataset: xr.Dataset) -> list[Table]:
-    """All values of a result of few points: a table for the results of the same dimensions, a column each."""
+    """Heads and rows of tables of a result of few points: one for the results of the same dimensions, a column each."""
     shown = [
         v
         for v in dataset.data_vars.values()
@@ -299,7 +284,7 @@ def _values_table(dataset: xr.Dataset, variables: list[xr.DataArray]) -> Table:
     head += [f"{str(v.name).replace('_', ' ')}{in_brackets(unit)}" for v, unit in zip(variables, units, strict=True)]
     columns = [[value_text(v, value) for value in v.values.reshape(-1)] for v in variables]
     rows = [[value for _, value, _ in place] + [c[k] for c in columns] for k, place in enumerate(places)]
-    return Table(head, rows)
+    return head, rows
 
 
 def value_text(variable: xr.DataArray, value: Any) -> str:
