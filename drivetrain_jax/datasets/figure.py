@@ -17,8 +17,7 @@ from drivetrain_jax import view
 from drivetrain_jax._errors import InputError, shown
 from drivetrain_jax._rules import BUILT_IN as declared
 from drivetrain_jax.resonances import BUILT_IN, Resonances
-from drivetrain_jax.view.style import is_joined, parameters, scene_key
-from drivetrain_jax.view.units import check_measured, in_units, listed, size
+from drivetrain_jax.view.style import check_measured, in_units, is_joined, listed, parameters, scene_key, size
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

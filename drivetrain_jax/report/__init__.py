@@ -23,7 +23,7 @@ from drivetrain_jax.datasets.figure import drawn, in_physical_data
 from drivetrain_jax.report.statements import amplitudes, axes_table, fixed_table, statements, values_tables
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.consolidate import open_result
-from drivetrain_jax.view.units import allowed_units, in_units, listed, unit_of, with_prefixes, written_units
+from drivetrain_jax.view.style import allowed_units, in_units, listed, unit_of, with_prefixes, written_units
 
 if TYPE_CHECKING:
     from drivetrain_jax.runs.atlas_file import StoredAtlas

@@ -16,8 +16,16 @@ import xarray as xr
 
 from drivetrain_jax.resonances import FREQUENCIES, operating_range, stored_orders
 from drivetrain_jax.view.charts import growth_of, role
-from drivetrain_jax.view.style import in_brackets, scene_key, units_of
-from drivetrain_jax.view.units import ASKED, suitable, unit_of, value_in, written_units
+from drivetrain_jax.view.style import (
+    ASKED,
+    in_brackets,
+    scene_key,
+    suitable,
+    unit_of,
+    units_of,
+    value_in,
+    written_units,
+)
 
 if TYPE_CHECKING:
     from drivetrain_jax.runs.reply import Limit

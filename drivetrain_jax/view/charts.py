@@ -36,11 +36,14 @@ from drivetrain_jax.view.style import (
     in_brackets,
     power_of_ten,
     scene_key,
+    size,
+    suitable,
     symbol,
     units_of,
+    value_in,
     variable_label,
+    with_prefixes,
 )
-from drivetrain_jax.view.units import size, suitable, value_in, with_prefixes
 
 FAILED, PENDING = "failed", "pending"
 # The flag of points that have a value, where nothing else is known about them.

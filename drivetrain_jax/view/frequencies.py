@@ -30,10 +30,11 @@ from drivetrain_jax.view.style import (
     axis_label,
     in_brackets,
     parameters,
+    suitable,
+    unit_of,
     units_of,
     variable_label,
 )
-from drivetrain_jax.view.units import suitable, unit_of
 
 # Colours of rigid modes, of the families in their order, and of coupled modes.
 _RIGID, _FAMILIES, _COUPLED = "#9a9a9a", ("#16324f", "#d1771e", "#3f8f5f", "#7a4fa0", "#999933"), "#a0308c"

@@ -122,7 +122,7 @@ def _draw_space(motion: xr.Dataset, space: Axes3D, shown: Sequence[str]) -> None
         axis.pane.set_facecolor("white")
     space.locator_params(nbins=4)
     space.view_init(elev=22, azim=-58)
-    space.set_box_aspect((1, 1, 0.8), zoom=1.05)  # pyright: ignore[reportArgumentType]
+    space.set_box_aspect((1, 1, 0.8), zoom=0.95)  # pyright: ignore[reportArgumentType]
 
 
 def thinned(curve: np.ndarray) -> np.ndarray:

@@ -23,10 +23,10 @@ from drivetrain_jax.view.style import (
     axis_label,
     in_brackets,
     parameters,
+    size,
     units_of,
     variable_label,
 )
-from drivetrain_jax.view.units import size
 
 # Label, colour and line width of each method, from the back to the front; the exact solution is a thin line with markers.
 _METHODS = {

@@ -9,7 +9,7 @@ import xarray as xr
 import drivetrain_jax as dt
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.datasets.figure import plot
-from drivetrain_jax.view.units import listed
+from drivetrain_jax.view.style import listed
 from tests.view import results
 from tests.view.results import texts
 
