@@ -88,11 +88,10 @@ def _trim(folder: Path, most: int) -> None:
 
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "numpy", "scipy")
 _ROOT = Path(drivetrain_jax.__file__).parent
-# Folders and files of this package that compute numbers, and the files in these folders that only read results.
+# Folders and files of this package that compute numbers.
 _FOLDERS = ("systems", "analysis", "atlas")
 _ENGINE = ("axes", "job", "kernel", "over", "resolve", "through_atlas")
 _FILES = ("_quantities", "analyses", "resonances", "store/parts", *(f"runs/{name}" for name in _ENGINE))
-_READER = "figure.py"
 
 
 def numerics_of(system: type[System], analysis: Analysis, route: str) -> dict[str, Any]:
@@ -136,8 +135,7 @@ def _own_sources() -> dict[str, str]:
     """Digests of the numeric code of this package, by folder or file."""
     parts = {f"{name}.py": [_ROOT / f"{name}.py"] for name in _FILES}
     for path in sorted(path for name in _FOLDERS for path in (_ROOT / name).rglob("*.py")):
-        if path.name != _READER:
-            parts.setdefault(path.parent.relative_to(_ROOT).as_posix(), []).append(path)
+        parts.setdefault(path.parent.relative_to(_ROOT).as_posix(), []).append(path)
     return {part: source_digest({path.name: path for path in paths}) for part, paths in parts.items()}
 
 
