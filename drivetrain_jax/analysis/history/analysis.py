@@ -306,16 +306,14 @@ def _by_component(system: type[System], values: Array, suffix: str) -> dict[str,
 
 def _effort(system: type[System], request: Request, most: float, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Predicted segments, shape (N,): strobes or periods, and requested times; infinite beyond ``most`` strobes."""
-    times = requested_times(request)
-    strobes = times[-1] / predicted(_period, (system.models["history"].build, system), columns)
+    times, size = requested_times(request), None if system.state_axis else len(system.state)
+    strobes = times[-1] / predicted(_period, (system.models["history"].build, size), columns)
     return np.where(strobes <= most, np.ceil(strobes) + len(times), np.inf)
 
 
-def _period(
-    build: Callable[..., Flow | PiecewiseLinearOscillator], system: type[System], values: Mapping[str, Any]
-) -> Array:
-    flow, size = build(values), len(system.state)
-    if isinstance(flow, Flow) and not system.state_axis and size != flow.size:
+def _period(build: Callable[..., Any], size: int | None, values: Mapping[str, Any]) -> Array:
+    flow = build(values)
+    if isinstance(flow, Flow) and size not in (None, flow.size):
         raise InputError(f"system: its flow has {flow.size} components; allowed is one for each of its state, {size}")
     return jnp.asarray(flow.period)
 
