@@ -94,14 +94,14 @@ def _smooth(system: type[System]) -> Smoothness:
     return system.models["atlas"].smooth or Smoothness({})
 
 
-def _middle(domain: Domain) -> dict[str, Any]:
-    """One value of each parameter."""
+def middle_of(domain: Domain) -> dict[str, Any]:
+    """The values of all parameters in the middle of a domain."""
     middle = {name: (a + b) / 2 for name, a, b in zip(domain.parameters, domain.lower, domain.upper, strict=True)}
     return {**domain.fixed, **middle}
 
 
 def _form(system: type[System], domain: Domain) -> LinearPeriodic:
-    return system.models["floquet"].build(_middle(domain)).reduced
+    return system.models["floquet"].build(middle_of(domain)).reduced
 
 
 def balanced_entries(system: type[System], domain: Domain, points: np.ndarray, entries: np.ndarray) -> np.ndarray:
@@ -109,7 +109,7 @@ def balanced_entries(system: type[System], domain: Domain, points: np.ndarray, e
     if (balance := _smooth(system).balance) is None:
         return entries
     values = {**domain.fixed, **dict(zip(domain.parameters, points.T, strict=True))}
-    left, right = (scales.reshape(len(scales), -1).T for scales in balance.scales(values, _middle(domain)))
+    left, right = (scales.reshape(len(scales), -1).T for scales in balance.scales(values, middle_of(domain)))
     matrices = entries.reshape(len(points), left.shape[1], -1)
     return (left[:, :, None] * matrices * right[:, None]).reshape(entries.shape)
 
@@ -167,25 +167,33 @@ _RADII, _ARCS = np.geomspace(1.03, 200, 120), 48
 def _degrees(
     system: type[System], domain: Domain, tolerance: float, lower: np.ndarray, upper: np.ndarray
 ) -> tuple[list[int], float]:
-    """Numbers of polynomials on a box, and the largest truncation error; infinite with more than ``_FEW`` coordinates.
+    """Numbers of polynomials on a box, and the largest truncation error; infinite with more than ``_FEW`` coordinates."""
+    corners = np.array(list(itertools.product(*zip(lower, upper, strict=True))))
+    columns = {**domain.fixed, **dict(zip(domain.parameters, domain.points(corners).T, strict=True))}
+    determinant = system.models["floquet"].build(columns).reduced.log_determinant
+    # The size of Phi falls with its determinant.
+    size = math.exp(float(np.min(determinant())) / 8) if determinant else 1.0
+    counts, error = polynomials_needed(system, domain, max(_TRUNCATED * tolerance * size, _ROUNDING), lower, upper)
+    return counts, error if len(lower) <= _FEW else math.inf
+
+
+def polynomials_needed(
+    system: type[System], domain: Domain, target: float, lower: np.ndarray, upper: np.ndarray
+) -> tuple[list[int], float]:
+    """Numbers of polynomials with which each coordinate leaves out at most ``target`` on a box, and a bound of the sum.
 
     Interpolation at n Chebyshev nodes of a function bounded by M on the ellipse of radius r leaves out at most
     4 M r^(1-n)/(r-1). With several coordinates these errors add up, each times the Lebesgue constants of earlier ones.
     """
     smooth, d = _smooth(system), len(lower)
     corners = np.array(list(itertools.product(*zip(lower, upper, strict=True)))).T
-    columns = {**domain.fixed, **dict(zip(domain.parameters, domain.points(corners.T).T, strict=True))}
-    determinant = system.models["floquet"].build(columns).reduced.log_determinant
-    # The size of Phi falls with its determinant.
-    size = math.exp(float(np.min(determinant())) / 8) if determinant else 1.0
-    target = max(_TRUNCATED * tolerance * size, _ROUNDING)
     fixed = {name: smooth.coordinate(name).forward(value) for name, value in domain.fixed.items()}
     x = {**fixed, **dict(zip(domain.parameters, corners[..., None, None], strict=True))}
     counts, error, lebesgue = [], 0.0, 1.0
     for k, name in enumerate(domain.parameters):
         around = (upper[k] + lower[k]) / 2 + (upper[k] - lower[k]) / 2 * _ARCS_AROUND
         with np.errstate(all="ignore"):
-            growth = smooth.balance.growth({**x, name: around}, _middle(domain))  # pyright: ignore[reportOptionalMemberAccess]
+            growth = smooth.balance.growth({**x, name: around}, middle_of(domain))  # pyright: ignore[reportOptionalMemberAccess]
         growth = np.broadcast_to(np.nan_to_num(growth, nan=np.inf), (2**d, *around.shape))
         largest = growth.max(axis=(0, 2)) + np.log(4 / (_RADII - 1))
         needed = 1 + (largest - math.log(target)) / np.log(_RADII)
@@ -195,7 +203,7 @@ def _degrees(
         counts.append(max(math.ceil(needed[best]), 1))
         error += lebesgue * math.exp(largest[best] - (counts[-1] - 1) * math.log(_RADII[best]))
         lebesgue *= 1 + 2 / math.pi * math.log(counts[-1] + 1)
-    return counts, error if d <= _FEW else math.inf
+    return counts, error
 
 
 def _ellipses() -> np.ndarray:

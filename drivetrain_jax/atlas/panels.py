@@ -8,6 +8,7 @@ parameters. With x in [-1, 1]^d the position within a panel,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -25,13 +26,15 @@ class Panel:
     """One box ``lower``..``upper``, both ``(d,)`` in the coordinates, with ``coefficients`` ``(n_1, ..., n_d, m)``.
 
     ``value_error`` bounds the Euclidean norm of the error of the m values. It is statistical (from held-out solves), not
-    proved, and excludes rounding at evaluation.
+    proved, and excludes rounding at evaluation. ``proved_error`` is a proved bound of the same (``atlas.proof``), infinite
+    where there is none.
     """
 
     lower: np.ndarray
     upper: np.ndarray
     coefficients: np.ndarray
     value_error: float
+    proved_error: float = math.inf
 
     @property
     def degrees(self) -> tuple[int, ...]:
@@ -213,7 +216,9 @@ def _fix(box: Panel | Gap, k: int, x: float) -> Panel | Gap:
     before, after = box.coefficients.shape[:k], box.coefficients.shape[k + 1 :]
     # Unlike `tensordot`, it copies nothing.
     coefficients = weights @ box.coefficients.reshape(*before, len(weights), -1)
-    return replace(box, lower=lower, upper=upper, coefficients=coefficients.reshape(*before, *after))
+    coefficients = coefficients.reshape(*before, *after)
+    # The proof does not cover the rounding of this product.
+    return replace(box, lower=lower, upper=upper, coefficients=coefficients, proved_error=math.inf)
 
 
 # Convert an atlas to plain arrays and words, and back.

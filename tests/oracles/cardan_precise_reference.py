@@ -30,12 +30,17 @@ _DIGITS = 60
 def spectral_radius(point: Mapping[str, float]) -> mpmath.mpf:
     """The spectral radius over the period pi; the stored parameters count as exact."""
     with mpmath.workdps(_DIGITS):
+        return max(abs(s) for s in multipliers(point))
+
+
+def multipliers(point: Mapping[str, float]) -> list[mpmath.mpc]:
+    """The four multipliers over the period pi."""
+    with mpmath.workdps(_DIGITS):
         z = mpmath.matrix(4, 4)
         for j, column in enumerate(_propagate(point)):
             for i, entry in enumerate(column):
                 z[i, j] = mpmath.mpf(int(entry)) / mpmath.mpf(2) ** BITS
-        sigma = mpmath.eig(z, left=False, right=False)
-        return max(abs(s) for s in sigma)
+        return mpmath.eig(z, left=False, right=False)
 
 
 def _propagate(point: Mapping[str, float]) -> list[list[int]]:
