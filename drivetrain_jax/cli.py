@@ -17,6 +17,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -50,13 +51,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         warnings.formatwarning = lambda message, *_, **__: one_line(f"warning: {message}")
         # Ctrl-C ends a command at once, also during a compilation; ``run`` has a handler of its own.
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:
-            # The parent process has closed this stream, so no one reads its output.
-            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
-        if arguments is None and isinstance(stream := getattr(sys, name), io.TextIOWrapper):
-            # The encoding of a terminal may lack characters of a title.
-            stream.reconfigure(errors="backslashreplace")
+    # A stream that the parent process has closed is None.
+    sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr) if arguments is None else ():
+        # The encoding of a terminal may lack characters of a title.
+        stream.reconfigure(errors="backslashreplace")  # pyright: ignore[reportAttributeAccessIssue]
     options = parser().parse_args(arguments)
     try:
         return options.command(options)
@@ -75,9 +74,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(one_line(f"{error.filename or 'standard output'}: {error.strerror}"))
         return WRONG_INPUT
     except (RuntimeError, AssertionError):
-        if (text := _backend_error()) is None:
+        if not _lacks_platform():
             raise
-        sys.stderr.write(one_line(text))
+        allowed = "jax cannot use it on this machine; allowed is cpu, or to unset the variable"
+        sys.stderr.write(one_line(f"JAX_PLATFORMS = {os.environ['JAX_PLATFORMS']!r}: {allowed}"))
         return WRONG_INPUT
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -92,18 +92,13 @@ def one_line(message: str) -> str:
     return f"drivetrain: {' '.join(message.split())}\n"
 
 
-def _backend_error() -> str | None:
-    """The message if jax cannot use the machines that ``JAX_PLATFORMS`` names; None if it can."""
-    wanted = os.environ.get("JAX_PLATFORMS")
-    if not wanted or "jax" not in sys.modules:
-        return None
+def _lacks_platform() -> bool:
+    """True if jax cannot use the machines that ``JAX_PLATFORMS`` names."""
     try:
-        sys.modules["jax"].devices()
+        return bool(os.environ.get("JAX_PLATFORMS")) and "jax" in sys.modules and not sys.modules["jax"].devices()
     # jax raises either, depending on the name.
     except (RuntimeError, AssertionError):
-        allowed = "allowed is cpu, or to unset the variable"
-        return f"JAX_PLATFORMS = {wanted!r}: jax cannot use it on this machine; {allowed}"
-    return None
+        return True
 
 
 # Arguments.
@@ -136,50 +131,39 @@ def path(text: str) -> Path:
     return Path(text).expanduser()
 
 
-# An argument as :meth:`argparse.ArgumentParser.add_argument` takes it.
-Argument = tuple[str, dict[str, Any]]
-
-
-def _value(name: str, metavar: str, text: str, **options: Any) -> Argument:
+def _argument(name: str, metavar: str, text: str, **options: Any) -> tuple[str, dict[str, Any]]:
+    """An argument as :meth:`argparse.ArgumentParser.add_argument` takes it."""
     return name, {"metavar": metavar, "help": text, **options}
 
 
-def _file(name: str, metavar: str, text: str, **options: Any) -> Argument:
-    return _value(name, metavar, text, type=path, **options)
-
-
-def _given(text: str) -> Argument:
-    # The default keeps argparse from reporting it as required.
-    return _value("given", "name=value", text, nargs="*", default=[])
-
-
-_JSON: Argument = "--json", {"action": "store_true", "help": "as one JSON object"}
+_file, _given = partial(_argument, type=path), partial(_argument, "given", "name=value", nargs="*", default=[])
+_JSON = "--json", {"action": "store_true", "help": "as one JSON object"}
 _ATLAS = _file("file", "FILE.nc", 'result of a scene with analysis = "atlas"')
 _DATA = _file(
     "--data", "TABLE", "table of parameters (.csv, .xlsx), a column each: length [mm]; given values override it"
 )
-_AMPLITUDE = _value(
+_AMPLITUDE = _argument(
     "--amplitude", "LIMIT", 'limit of the forced amplitude ("2 deg"), to compare the forced motion with'
 )
 _SCENE = (
     _file("scene", "SCENE.toml", "scene file, or a name of `drivetrain list`"),
     _file("--out", "FILE.nc", "result file", required=True),
-    _value("--set", "KEY=VALUE", "replace an entry of the scene: fixed.zeta=0.002", action="append", default=[]),
+    _argument("--set", "KEY=VALUE", "replace an entry of the scene: fixed.zeta=0.002", action="append", default=[]),
     _DATA,
 )
 _QUESTIONS = ("least-damping", "widest-angle", "speed-windows")
 
 # The text of every command, and its arguments; the function has the name of the command.
-_COMMANDS: dict[str, tuple[str, tuple[Argument, ...]]] = {
+_COMMANDS: dict[str, tuple[str, tuple[Any, ...]]] = {
     "list": ("list systems, analyses, parameters and scenes", (
-        _value("system", "SYSTEM", "describe this system", nargs="?"),
+        _argument("system", "SYSTEM", "describe this system", nargs="?"),
     )),
     "run": ("compute a scene, or resume an interrupted run", (
         *_SCENE,
         ("--fresh", {"action": "store_true", "help": "compute all points again; replace result and unfinished work"}),
-        _value("--threads", "N", "number of threads (default: usable cores)", type=int),
-        _value("--workers", "N", "N Dask workers instead of threads, as --dask local:N; a worker may crash", type=int),
-        _value("--dask", "ADDRESS", "Dask cluster instead of threads: tcp://HOST:PORT or local:N"),
+        _argument("--threads", "N", "number of threads (default: usable cores)", type=int),
+        _argument("--workers", "N", "N Dask workers instead of threads, as --dask local:N; a worker may crash", type=int),
+        _argument("--dask", "ADDRESS", "Dask cluster instead of threads: tcp://HOST:PORT or local:N"),
         _file("--reuse", "FILE.nc", "reuse the common points of this result; a smaller result at --out is always reused",
               action="append", default=[]),
         ("--store", {"choices": ("hdf5", "zarr"), "help": "zarr: workers write a Zarr store (default if so named)"}),
@@ -192,26 +176,26 @@ _COMMANDS: dict[str, tuple[str, tuple[Argument, ...]]] = {
     "export": ("write a Zarr store as one HDF5 file, or a result as CSV", (
         _file("store", "RESULT", "a Zarr store, or with --csv any result on a grid"),
         _file("file", "FILE.nc", "HDF5 file to write", nargs="?"),
-        _value("--csv", "TABLE.csv", nargs="?", const="",
+        _argument("--csv", "TABLE.csv", nargs="?", const="",
                text="write a table (default: RESULT.csv): one row a point, units in the header, codes as words"),
     )),
     "plot": ("draw the figure of a result", (
         _file("files", "FILE.nc", "results; overlaid: methods of one analysis, or a chart and its atlas", nargs="+"),
         _file("--out", "FIGURE", "figure (.png, .pdf, .svg) or table of constants (.txt, .csv)", required=True),
-        _value("--part", "name=LOW:HIGH", "part of an atlas: ranges, or name=value", nargs="+", default=[]),
-        _value("--cells", "N", "cells per axis for an atlas (default: 800)", type=int),
-        _value("--units", "rpm,deg", "units of the axes (default: those of the scene)"),
+        _argument("--part", "name=LOW:HIGH", "part of an atlas: ranges, or name=value", nargs="+", default=[]),
+        _argument("--cells", "N", "cells per axis for an atlas (default: 800)", type=int),
+        _argument("--units", "rpm,deg", "units of the axes (default: those of the scene)"),
     )),
     "report": ("write a report on results: one HTML file that prints well", (
         _file("files", "FILE.nc", "results, one section each", nargs="+"),
         _file("--out", "REPORT.html", "page to write", required=True),
-        _value("--title", "TEXT", "heading (default: the title of the scene)"),
-        _value("--units", "rpm,deg", "units of the report (default: those of the scenes)"),
+        _argument("--title", "TEXT", "heading (default: the title of the scene)"),
+        _argument("--units", "rpm,deg", "units of the report (default: those of the scenes)"),
         _AMPLITUDE,
     )),
     "point": ("compute one point", (
-        _value("system", "SYSTEM", "name from `drivetrain list`"),
-        _value("analysis", "ANALYSIS", "name from `drivetrain list SYSTEM`"),
+        _argument("system", "SYSTEM", "name from `drivetrain list`"),
+        _argument("analysis", "ANALYSIS", "name from `drivetrain list SYSTEM`"),
         _given("parameters in the units of `drivetrain list SYSTEM`, options, and outputs=NAME,NAME"),
         _DATA, _AMPLITUDE,
         ("--sensitivities", {
@@ -223,16 +207,16 @@ _COMMANDS: dict[str, tuple[str, tuple[Argument, ...]]] = {
         _ATLAS, _given("parameters, or physical data"), _AMPLITUDE, _JSON,
     )),
     "design": ("answer a design question from a stored atlas", (
-        _value("question", "QUESTION", ", ".join(_QUESTIONS), choices=_QUESTIONS),
+        _argument("question", "QUESTION", ", ".join(_QUESTIONS), choices=_QUESTIONS),
         _ATLAS, _given("parameters; a range is name=LOW:HIGH"), _AMPLITUDE,
-        _value("--margin", "PART", "speed-windows: relative distance in speed from every boundary", type=number),
+        _argument("--margin", "PART", "speed-windows: relative distance in speed from every boundary", type=number),
         _JSON,
     )),
     "explore": ("write a page that evaluates a stored atlas in a browser", (
         _ATLAS, _file("--out", "PAGE.html", "page to write (.html)", required=True),
     )),
     "bench": ("measure error and run time, compared with peers (source checkout only)", (
-        _value("systems", "SYSTEM", "only the studies of these systems", nargs="*", default=[]),
+        _argument("systems", "SYSTEM", "only the studies of these systems", nargs="*", default=[]),
         ("--quick", {"action": "store_true", "help": "small versions (minutes); do not change the stored results"}),
         _file("--out", "FOLDER", "output folder"),
     )),
@@ -400,16 +384,10 @@ def _stop_on_signals() -> Iterator[Callable[[], None]]:
 
 def _overrides(options: argparse.Namespace) -> dict[str, Any]:
     """Entries of the scene that the command line replaces."""
-    return {f"fixed.{name}": value for name, value in _tabulated(options).items()} | assignments(options.set, "--set")
-
-
-def _tabulated(options: argparse.Namespace) -> dict[str, Any]:
-    """The values of the table ``--data``."""
-    if options.data is None:
-        return {}
     from drivetrain_jax.runs.physical import read_table
 
-    return read_table(options.data)
+    table = {} if options.data is None else read_table(options.data)
+    return {f"fixed.{name}": value for name, value in table.items()} | assignments(options.set, "--set")
 
 
 def status(options: argparse.Namespace) -> int:
@@ -519,16 +497,14 @@ def point(options: argparse.Namespace) -> int:
     from drivetrain_jax.runs.point import point
 
     given = assignments(options.given, "point")
-    for name in ("system", "analysis"):
+    asked = {"amplitude": options.amplitude, "sensitivities": options.sensitivities, "data": options.data}
+    for name in ("system", "analysis", *asked):
         if name in given:
-            raise InputError(f"{name} = {given[name]!r}: given twice; allowed is once, in front of the values")
-    for name in ("amplitude", "sensitivities", "data"):
-        if name in given:
-            raise InputError(f"{name} = {given[name]!r}: not a parameter; did you mean the option --{name}?")
+            place = f"did you mean the option --{name}?" if name in asked else "allowed is once, in front of the values"
+            raise InputError(f"{name} = {given[name]!r}: not a parameter; {place}")
     outputs = given.pop("outputs", None)
     if isinstance(outputs, str):
         outputs = outputs.split(",")
-    asked = {"amplitude": options.amplitude, "sensitivities": options.sensitivities, "data": options.data}
     return _answer(point(options.system, options.analysis, outputs=outputs, **asked, **given), options)
 
 
@@ -606,19 +582,16 @@ def progress_line() -> Iterator[Callable[[Progress], None]]:
 
 
 @contextmanager
-def _reading(*files: Path) -> Iterator[None]:
+def _reading(first: Path, *more: Path) -> Iterator[None]:
     """Show on a terminal that the command works on these files, and remove the line at the end."""
     terminal = sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
-    if terminal:
-        first, *more = [file.name for file in files]
-        sys.stderr.write(f"{first}{f' and {len(more)} more' if more else ''} ...\r")
-        sys.stderr.flush()
+    write = partial(print, end="", file=sys.stderr, flush=True) if terminal else lambda _: None
+    write(f"{first.name}{f' and {len(more)} more' if more else ''} ...\r")
     try:
         yield
     finally:
-        if terminal:
-            # Clear the line.
-            sys.stderr.write("\x1b[K")
+        # Clear the line.
+        write("\x1b[K")
 
 
 if __name__ == "__main__":
