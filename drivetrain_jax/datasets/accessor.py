@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Hashable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from drivetrain_jax.runs.atlas_file import StoredAtlas
     from drivetrain_jax.runs.reply import Reply
 
-# Rows that are in memory at a time.
+# Rows that are text in memory at a time.
 _ROWS = 100_000
 # Longest dimension of an analysis whose entries are columns; those of a longer one, such as time, are rows.
 _MOST_COLUMNS = 32
@@ -228,6 +228,9 @@ def write_csv(source: Path, out: Path) -> int:
 
     Raises: :class:`~drivetrain_jax.InputError` for an atlas, which is a function.
     """
+    # Local import: it takes a third of a second.
+    import pandas as pd
+
     from drivetrain_jax.store.consolidate import open_result
     from drivetrain_jax.store.files import move_into_place
 
@@ -238,36 +241,18 @@ def write_csv(source: Path, out: Path) -> int:
         )
     temporary = out.with_name(f"{out.name}.tmp")
     try:
-        with open(temporary, "w", encoding="utf-8", newline="") as file:
-            for number, block in enumerate(_blocks(dataset)):
-                block.to_csv(file, index=False, header=number == 0)
+        table = pd.DataFrame({name: np.ravel(values) for name, values in _columns(dataset)})
+        table.to_csv(temporary, index=False, chunksize=_ROWS)
         move_into_place(temporary, out)
     finally:
         temporary.unlink(missing_ok=True)
-    return int(np.prod([dataset.sizes[dim] for dim in _row_dims(dataset)], dtype=int))
-
-
-def _row_dims(dataset: xr.Dataset) -> tuple[Hashable, ...]:
-    sweep = dataset["outcome"].dims
-    return (*sweep, *(dim for dim, size in dataset.sizes.items() if dim not in sweep and size > _MOST_COLUMNS))
-
-
-def _blocks(dataset: xr.Dataset) -> Iterator[Any]:
-    """Tables of consecutive points."""
-    # Local import: it takes a third of a second.
-    import pandas as pd
-
-    shape = tuple(dataset.sizes[dim] for dim in _row_dims(dataset))
-    columns, count = dict(_columns(dataset)), int(np.prod(shape, dtype=int))
-    for start in range(0, max(count, 1), _ROWS):
-        rows = np.arange(start, min(start + _ROWS, count))
-        place = np.unravel_index(rows, shape) if shape else ()
-        yield pd.DataFrame({name: np.atleast_1d(values[place]) for name, values in columns.items()})
+    return len(table)
 
 
 def _columns(dataset: xr.Dataset) -> Iterator[tuple[str, np.ndarray]]:
     """Header and values, with the shape of all rows, of every column."""
-    sweep = _row_dims(dataset)
+    sweep = dataset["outcome"].dims
+    sweep = (*sweep, *(dim for dim, size in dataset.sizes.items() if dim not in sweep and size > _MOST_COLUMNS))
     along = [c for c in dataset.coords.values() if c.ndim and set(c.dims) <= set(sweep)]
     for variable in (*along, *dataset.data_vars.values()):
         words = in_words(variable.variable) if "flag_meanings" in variable.attrs else variable.variable

@@ -194,17 +194,13 @@ def flag_scale(variable: xr.DataArray, strength: float = 1.0) -> dict[str, Any]:
 def flag_entries(variable: xr.DataArray, strength: float = 1.0) -> list[Patch]:
     """Legend entries of the flags that occur in a variable of :func:`valid`; with their numbers of points, unless these are
     many."""
-    names = [*flags(variable), FAILED, PENDING]
+    names, entries = [*flags(variable), FAILED, PENDING], []
     counts = np.bincount(variable.values.astype(int).ravel(), minlength=len(names))
-    colours = flag_scale(variable, strength)["cmap"].colors
-    notes = [
-        f" ({n})" * (variable.size <= _COUNTED or name in _ALARMING) for name, n in zip(names, counts, strict=True)
-    ]
-    return [
-        Patch(facecolor=colour, edgecolor=FRAME_GREY, linewidth=0.6, label=name.replace("_", " ") + note)
-        for name, colour, note, n in zip(names, colours, notes, counts, strict=True)
-        if n and name != _COMPUTED
-    ]
+    for name, colour, count in zip(names, flag_scale(variable, strength)["cmap"].colors, counts, strict=True):
+        label = name.replace("_", " ") + f" ({count})" * (variable.size <= _COUNTED or name in _ALARMING)
+        if count and name != _COMPUTED:
+            entries.append(Patch(facecolor=colour, edgecolor=FRAME_GREY, linewidth=0.6, label=label))
+    return entries
 
 
 def computed(dataset: xr.Dataset) -> xr.DataArray:
@@ -286,8 +282,8 @@ def colours(field: xr.DataArray, growth: Growth | None = None) -> tuple[dict[str
     differ widely."""
     if flags(field):
         return flag_scale(field), {}
-    values = field.values[np.isfinite(field.values) | (growth is not None)]
     if growth is None:
+        values = field.values[np.isfinite(field.values)]
         positive = values[values > 0]
         low, high = (values.min(), values.max()) if values.size else (0.0, 1.0)
         logarithmic = low >= 0 and positive.size > 0 and high > _WIDE * positive.min()
@@ -296,10 +292,8 @@ def colours(field: xr.DataArray, growth: Growth | None = None) -> tuple[dict[str
     high = growth.largest
     cmap = LinearSegmentedColormap.from_list("growth", [((1 + x) / 2, colour) for x, colour in _GROWTH_COLOURS], N=1024)
     norm = SymLogNorm(growth.linear, linscale=0.5, vmin=-high, vmax=high, base=10)
-    beyond = (bool((values < -high).any()), bool((values > high).any()))
-    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
     decades = 10.0 ** np.arange(np.log10(growth.linear) + 1, np.log10(high) + 0.5)
-    bar = {"extend": extend, "ticks": [*-decades[::-1], 0.0, *decades]}
+    bar = {"extend": "both", "ticks": [*-decades[::-1], 0.0, *decades]}
     return {"cmap": cmap.with_extremes(bad=FAILED_COLOUR), "norm": norm}, bar
 
 
@@ -334,6 +328,8 @@ def chart(
         return _table(dataset)
     along = (names or long)[0]
     lines = [keys for keys in stored if all(along in dataset[key].dims and dataset[key].ndim < 3 for key in keys)]
+    if not lines:
+        raise wrong_axes(dataset, f"none for {stored[0][0]}, which has several dimensions of its own")
     shown = lines[:_MOST_PANELS]
     left_out = f"{len(shown)} of {len(stored)} results shown" if len(shown) < len(stored) else ""
     return stack(dataset, along, shown, **look).finish(dataset, left_out)

@@ -11,6 +11,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.view import charts
@@ -143,6 +144,8 @@ def _sweeps(results: list[xr.Dataset], path: str) -> Figure:
             charts.draw_flags(upper, regime.sel(sweep_direction=direction), path, (foot, foot + 0.035))
             place: dict[str, Any] = {"transform": upper.transAxes, "color": FRAME_GREY}
             upper.text(1.005, foot + 0.0175, direction, va="center", size=6.5, **place)
+            # A frame, because the colour of motions without separation is none.
+            upper.add_patch(Rectangle((0, foot), 1, 0.035, fill=False, linewidth=0.4, clip_on=False, **place))
         sheet.add(*charts.flag_entries(regime))
     half = charts.half_play(best)
     if half is not None and half < upper.get_ylim()[1]:
