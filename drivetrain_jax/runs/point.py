@@ -223,6 +223,7 @@ def point(
     except InputError as error:
         # Messages name the fields without the tables of a scene.
         raise InputError(re.sub(r"^(points|fixed|options)\.", "", str(error))) from None
+    limit = None if amplitude is None else Limit.of(job.scene.system, amplitude)
     found = _result(job, _compute(job))
     if sensitivities:
         # Local import: a point without sensitivities needs no atlas.
@@ -231,13 +232,13 @@ def point(
         data = {name: value for name, (value, _) in found.physical.items()}
         effects = point_sensitivities(job.scene.system, found.parameters, data) if found.outcome.has_value else None
         found = replace(found, sensitivities=effects or [], _effects=gradient_lines(effects))
-    return found if amplitude is None else replace(found, forced=_forced(found, given, amplitude))
+    return found if limit is None else replace(found, forced=_forced(found, given, limit))
 
 
-def _forced(found: PointResult, given: Mapping[str, Any], amplitude: Any) -> tuple[str, dict[str, Any]]:
+def _forced(found: PointResult, given: Mapping[str, Any], limit: Limit) -> tuple[str, dict[str, Any]]:
     """The comparison of the forced motion at the same point with a limit, as text and data."""
-    system = system_and_analysis(found.system, found.analysis)[0]
-    limit, parameters = Limit.of(system, amplitude), {n: x for n, x in given.items() if n in described(system)}
+    parameters = described(system_and_analysis(found.system, found.analysis)[0])
+    parameters = {name: value for name, value in given.items() if name in parameters}
     known = dict(found.values)
     for analysis, name in (("forced", "amplitude"), ("floquet", "verdict")):
         if name not in known:
