@@ -223,6 +223,8 @@ def point(
     except InputError as error:
         # Messages name the fields without the tables of a scene.
         raise InputError(re.sub(r"^(points|fixed|options)\.", "", str(error))) from None
+    if sensitivities and "floquet" not in job.scene.system.models:
+        raise InputError(f"sensitivities: {system} has no spectral radius; allowed for floquet")
     limit = None if amplitude is None else Limit.of(job.scene.system, amplitude)
     found = _result(job, _compute(job))
     if sensitivities:

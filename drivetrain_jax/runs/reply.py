@@ -184,9 +184,7 @@ def point_sensitivities(
     system: type[System], point: Mapping[str, Any], physical: Mapping[str, Any]
 ) -> list[Sensitivity] | None:
     """Sensitivities of the spectral radius at a ``point`` (parameters) that follows from ``physical`` data, if any; None
-    without a gradient. Raises :class:`InputError` for a system without a spectral radius."""
-    if "floquet" not in system.models:
-        raise InputError(f"sensitivities: {system.name} has no spectral radius; allowed for floquet")
+    without a gradient."""
     slopes = radius_gradient(system, point)
     shaft = GivenData(system.physical, physical) if physical and system.physical else None
     return None if slopes is None else _of_radius(system, shaft, point, slopes)
