@@ -65,14 +65,14 @@ def plot(
     datasets = [_dataset(source) for source in sources]
     kinds = [dataset.attrs.get("analysis") for dataset in datasets]
     if kinds == ["atlas"]:
-        return drawn([_chart(sources[0], datasets[0], part, cells)], asked)
+        return drawn([_chart(sources[0], part, cells)], asked)
     if part is not None or cells is not None:
         field = f"part = {shown(part)}" if part is not None else f"cells = {cells}"
         raise InputError(f"{field}: a result on a grid is drawn whole; allowed for an atlas")
     if kinds == ["floquet", "atlas"]:
         from drivetrain_jax.runs.atlas_chart import with_boundaries
 
-        return drawn([with_boundaries(_loaded(datasets[0]), _place(sources[1], datasets[1]))], asked)
+        return drawn([with_boundaries(_loaded(datasets[0]), sources[1])], asked)
     if "atlas" in kinds:
         raise InputError("results: an atlas among several; allowed is an atlas alone, or a chart and its atlas")
     try:
@@ -149,12 +149,7 @@ def _opened(path: Path) -> xr.Dataset:
     return output.open_result(path)
 
 
-def _chart(
-    source: Result,
-    dataset: xr.Dataset,
-    part: Mapping[str, Any] | None,
-    cells: int | None,
-) -> xr.Dataset:
+def _chart(source: Result, part: Mapping[str, Any] | None, cells: int | None) -> xr.Dataset:
     from drivetrain_jax.runs.atlas_chart import chart
 
     if part is not None and not isinstance(part, Mapping):
@@ -163,12 +158,7 @@ def _chart(
         if isinstance(value, (list, tuple)) and len(value) != 2:
             raise InputError(f"part.{name} = {shown(value)}: allowed is a number or (low, high)")
     shown_part = {name: tuple(value) if isinstance(value, list) else value for name, value in (part or {}).items()}
-    return chart(_place(source, dataset), shown_part, CELLS if cells is None else cells)
-
-
-def _place(source: Result, dataset: xr.Dataset) -> Path | xr.Dataset:
-    """The file of an atlas, which is checked for damage as it is opened; its dataset if it has no file."""
-    return Path(source) if isinstance(source, (str, Path)) else dataset
+    return chart(source, shown_part, CELLS if cells is None else cells)
 
 
 def in_physical_data(dataset: xr.Dataset, asked: Sequence[str]) -> xr.Dataset:

@@ -37,7 +37,7 @@ Convert = Callable[[Any], Any]
 _SLICES = 3
 
 
-def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, float]], cells: int) -> xr.Dataset:
+def chart(source: str | Path | xr.Dataset, part: Mapping[str, float | tuple[float, float]], cells: int) -> xr.Dataset:
     """The ``floquet`` result on ``cells`` values of each of two parameters of the atlas in ``source``.
 
     ``part`` fixes parameters (numbers) or restricts them (ranges). Any further parameter gets three values. The chart also
@@ -69,7 +69,7 @@ def chart(source: Path | xr.Dataset, part: Mapping[str, float | tuple[float, flo
     return dataset
 
 
-def with_boundaries(dataset: xr.Dataset, source: Path | xr.Dataset) -> xr.Dataset:
+def with_boundaries(dataset: xr.Dataset, source: str | Path | xr.Dataset) -> xr.Dataset:
     """``dataset``, a chart over two parameters, with the boundaries and tips of the atlas in ``source``.
 
     Raises :class:`InputError` for an atlas of another system or of other fixed values, or of less than the chart's range.

@@ -49,6 +49,8 @@ _NEAR, _SPLIT = 0.01, 1e-6
 # Range of interference diagrams relative to the outermost crossings, and to the highest operating speed; most modes of which
 # all orders have numbers, which stand below the line of the mode.
 _SPACE, _BEYOND, _FEW_MODES = 1.12, 1.4, 8
+# Width of a number relative to the range of speeds.
+_WIDTH = 0.08
 _NUMBER: dict[str, Any] = {"va": "top", "path_effects": [withStroke(linewidth=2, foreground="white")]}
 # Results that are drawn, the first one that is stored.
 _SPEEDS = ("critical_speed", *FREQUENCIES)
@@ -460,11 +462,13 @@ def _interference(dataset: xr.Dataset, orders: Orders, colours: Any, kinds: Mapp
         style = {"color": "black", "linewidth": 0.9, "linestyle": dashes, "label": f"{label} ({times:g}/turn)"}
         sheet.add(*axes.plot([0, high], [0, times * high / 60], **style))
         met = np.stack([speeds[shown, k], frequency[shown]], axis=-1)
-        met = met[met[:, 0] <= high]
-        axes.plot(*met.T, "o", markersize=3.5, color="black", markerfacecolor="white")
+        gap, inside = speeds[shown] - met[:, :1], met[:, 0] <= high
+        # The number of a crossing stands at its right, where another order may cross the mode.
+        crowded = np.any((gap > 0) & (gap < _WIDTH * high), axis=1)
+        axes.plot(*met[inside].T, "o", markersize=3.5, color="black", markerfacecolor="white")
         if k == 0 or operating or shown.size <= _FEW_MODES:
             # One number for modes of the same frequency.
-            numbers = {f"{speed:.0f}": (speed, height) for speed, height in met}
+            numbers = {f"{speed:.0f}": (speed, height) for speed, height in met[inside & ~crowded]}
             sheet.later(partial(write_names, axes, list(numbers.values()), list(numbers), offset=4.0, **_NUMBER))
     if operating:
         sheet.add(axes.axvspan(*operating, **_OPERATING))

@@ -99,7 +99,7 @@ def draw_predictions(axes: Axes, lines: list[Prediction], below: bool = False) -
 
 def label_predictions(axes: Axes, lines: list[Prediction]) -> None:
     """Label lines beyond the upper or right edge of ``axes``; where there is no space for all, lines of low order."""
-    left, right = axes.get_xlim()
+    (left, right), lines = axes.get_xlim(), sorted(lines, key=lambda line: line.order)
     top = [(line, (line.x[-1], axes.get_ylim()[1])) for line in lines if left <= line.x[-1] <= right]
     side = []
     for line in lines:
@@ -109,8 +109,7 @@ def label_predictions(axes: Axes, lines: list[Prediction]) -> None:
             side.append((line, (right, np.interp(right, line.x[i], line.y[i]))))
     for ends, above in ((top, True), (side, False)):
         names = [label_text(line.label) for line, _ in ends]
-        ranks = [line.order for line, _ in ends]
-        write_names(axes, [end for _, end in ends], names, above=above, ranks=ranks, colours=PREDICTION, offset=9.0)
+        write_names(axes, [end for _, end in ends], names, above=above, colours=PREDICTION, offset=9.0)
 
 
 def draw_boundaries(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Line2D]:

@@ -191,15 +191,14 @@ def write_names(
     names: Sequence[str],
     *,
     above: bool = False,
-    ranks: Sequence[int] = (),
     offset: float = 3.0,
     colours: Any = FRAME_GREY,
     **look: Any,
 ) -> None:
     """Write ``names`` to the right of ``points`` (or ``above``), ``offset`` points away, with a line to a name that moved.
 
-    Names keep the order of their points. Where there is no space for all, those of the smallest ``ranks`` stay. ``look``
-    goes to :meth:`matplotlib.axes.Axes.annotate`.
+    Names keep the order of their points. Where there is no space for all, the first stay. ``look`` goes to
+    :meth:`matplotlib.axes.Axes.annotate`.
     """
     colours = [colours] * len(names) if isinstance(colours, str) else list(colours)
     scale, spacing, axis = 72 / axes.figure.dpi, _SPACING[above], 0 if above else 1
@@ -207,7 +206,7 @@ def write_names(
     span = axes.bbox.get_points()[:, axis] * scale + (-spacing, spacing)
     kept: list[int] = []
     shifts = np.empty(0)
-    for k in np.argsort(ranks if len(ranks) else np.arange(len(names)), kind="stable").tolist():
+    for k in range(len(names)):
         trial = sorted([*kept, k], key=lambda i: places[i])
         moved = _apart(places[trial], spacing, *span) - places[trial]
         if (np.abs(moved) <= _MOST_SHIFT).all():
