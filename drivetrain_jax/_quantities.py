@@ -11,7 +11,7 @@ from numbers import Real
 from typing import Any
 
 from drivetrain_jax import _units
-from drivetrain_jax._errors import shown
+from drivetrain_jax._errors import InputError, shown
 
 _QUOTIENT = re.compile(r"\s*([+-]?\d{1,9})\s*/\s*([1-9]\d{0,8})\s*")
 # First code of ``outcome`` without a value.
@@ -93,20 +93,20 @@ class Parameter:
         return self.allowed if self.units == "1" else f"{self.allowed}, in {self.units}"
 
     def check(self, value: object) -> float | int | str | tuple[float, ...]:
-        """Return ``value`` in its stored type, or raise ``ValueError`` with one line that names the range."""
+        """Return ``value`` in its stored type, or raise ``InputError`` with one line that names the range."""
         if self.choices:
             # A word that looks like a number needs no quotes.
             value = str(value) if isinstance(value, int) and str(value) in self.choices else value
             if not isinstance(value, str) or value not in self.choices:
-                raise ValueError(f"{self.name} = {shown(value)}: allowed is {self.allowed}")
+                raise InputError(f"{self.name} = {shown(value)}: allowed is {self.allowed}")
             return value
         if self.text:
             if not isinstance(value, str):
-                raise ValueError(f"{self.name} = {shown(value)}: allowed is text")
+                raise InputError(f"{self.name} = {shown(value)}: allowed is text")
             return value
         if self.listed and not (self.broadcast and not isinstance(value, (list, tuple))):
             if not isinstance(value, (list, tuple)) or not value:
-                raise ValueError(f"{self.name} = {shown(value)}: allowed is a list of numbers, {self.allowed}")
+                raise InputError(f"{self.name} = {shown(value)}: allowed is a list of numbers, {self.allowed}")
             return tuple(self._check_number(entry, f"{self.name}[{i}]") for i, entry in enumerate(value))
         return self._check_number(value, self.name)
 
@@ -119,12 +119,12 @@ class Parameter:
         elif isinstance(value, Decimal) or (isinstance(value, Real) and not isinstance(value, (bool, int, float))):
             value = float(value)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise ValueError(f"{label} = {shown(value)}: allowed is a number, {self.allowed}")
+            raise InputError(f"{label} = {shown(value)}: allowed is a number, {self.allowed}")
         if isinstance(value, int) and value.bit_length() > 1024:
-            raise ValueError(f"{label}: an integer of {value.bit_length()} bits; allowed is {self.allowed_in_units}")
+            raise InputError(f"{label}: an integer of {value.bit_length()} bits; allowed is {self.allowed_in_units}")
         if not self._is_within(value) or (self.integer and value != int(value)):
             guess = "" if written else self._meant(value)
-            raise ValueError(f"{label} = {value!r}: allowed is {self.allowed_in_units}{guess}")
+            raise InputError(f"{label} = {value!r}: allowed is {self.allowed_in_units}{guess}")
         if value > self.usual:
             usual = f"more than {self.usual:g} {self.units}"
             warnings.warn(f'{label} = {value:.10g} {self.units}: {usual}; is "{value:.10g} mm" meant?', stacklevel=2)
@@ -138,15 +138,15 @@ class Parameter:
         return not (below or above) and (math.isfinite(value) or (self.infinite and value == math.inf))
 
     def _in_units(self, text: str, label: str) -> float:
-        """The number that ``text`` writes with a unit, or ``ValueError`` with one line."""
+        """The number that ``text`` writes with a unit, or ``InputError`` with one line."""
         try:
             return _units.number(text, self.units)
         except _units.UnitError as error:
             if _units.split(text) is None:
-                raise ValueError(f"{label} = {shown(text)}: allowed is a number, {self.allowed}") from None
+                raise InputError(f"{label} = {shown(text)}: allowed is a number, {self.allowed}") from None
             error = f"{error}{_units.misread(text)}"
             unit = "a number without unit" if self.units == "1" else f"a number in {self.units} or in a unit like it"
-            raise ValueError(f"{label} = {shown(text)}: {error}; allowed is {unit}, {self.allowed}") from None
+            raise InputError(f"{label} = {shown(text)}: {error}; allowed is {unit}, {self.allowed}") from None
 
     def _meant(self, value: float) -> str:
         """A question, if ``value`` would be in the range as an angle in degrees."""

@@ -5,9 +5,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 from jax import Array
@@ -71,10 +71,6 @@ def _results(phi: Monodromy, outputs: tuple[str, ...]) -> dict[str, Array]:
     return {name: results[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}
 
 
-def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
-    return tuple(Dimension(name, "row times size plus column", ()) for name in ("entry",))
-
-
 SOLVES = Analysis(
     name="atlas",
     title="Propagator of a linear periodic system, for its atlas",
@@ -84,7 +80,7 @@ SOLVES = Analysis(
     method_titles={"direct": "direct solves of floquet at the nodes of Chebyshev panels"},
     options=(RTOL,),
     solvers=_propagator_solvers,
-    dimensions=_dimensions,
+    dimensions=lambda *_: (Dimension("entry", "row times size plus column", ()),),
 )
 
 

@@ -163,11 +163,9 @@ def spread(table: AxisTable, field: str) -> np.ndarray:
     if table.values is not None:
         values = np.array(table.values, float)
     else:
-        ends, num = (
-            (float(cast(float, table.start)), float(cast(float, table.stop))),
-            2 if table.num is None else table.num,
-        )
-        values = np.geomspace(*ends, num) if table.scale == "log" else np.linspace(*ends, num)
+        start, stop = (float(cast(float, end)) for end in (table.start, table.stop))
+        space = np.geomspace if table.scale == "log" else np.linspace
+        values = space(start, stop, 2 if table.num is None else table.num)
     ordered = np.sort(values)
     double = np.flatnonzero(ordered[1:] == ordered[:-1])
     if double.size:
@@ -196,16 +194,14 @@ class Grid:
     def of(cls, scene: Problem) -> Grid:
         """The grid of ``scene``; a fixed path parameter gives lines of one value."""
         parameters = scene.analysis.model(scene.system).parameters
-        name = scene.path_axis
+        name, path = scene.path_axis, None
         numbers = {n: value for n, value in _numbers(scene).items() if n != name}
-        if name is None:
-            return cls(scene.axes, scene.zipped, scene.fixed, parameters, numbers, result_bytes=scene.result_bytes)
         position = next((i for i, axis in enumerate(scene.axes) if axis.name == name), None)
-        if position is None:
+        if position is not None:
+            path = scene.axes[position]
+        elif name is not None:
             path = Axis(name, scene.system.parameter(name), None, np.array([scene.fixed[name]]))
-            return cls(scene.axes, scene.zipped, scene.fixed, parameters, numbers, path, None, scene.result_bytes)
-        others = scene.axes[:position] + scene.axes[position + 1 :]
-        path = scene.axes[position]
+        others = tuple(axis for axis in scene.axes if axis is not path)
         return cls(others, scene.zipped, scene.fixed, parameters, numbers, path, position, scene.result_bytes)
 
     @property

@@ -137,7 +137,7 @@ def in_parameters(
     ``known`` are physical data of the scene, which the question need not repeat.
     """
     allowed, physical = described(system), system.physical
-    written = any(isinstance(end, str) for value in given.values() for end in _ends(value))
+    written = any(isinstance(end, str) for v in given.values() for end in (v if isinstance(v, tuple) else (v,)))
     names = physical.names if physical else ()
     values = {n: _numbers(allowed[n], v, n in names) if n in allowed else v for n, v in given.items()}
     if physical is None or not (written or known or any(name in names for name in given)):
@@ -150,10 +150,6 @@ def in_parameters(
     found = {n: v for n, v in physical.converted(pool).items() if n not in names and n not in repeated}
     converted = {n: tuple(v.values.tolist()) if isinstance(v, Along) else v for n, v in found.items()}
     return GivenData(physical, data), {n: v for n, v in values.items() if n not in names} | converted
-
-
-def _ends(value: Any) -> tuple[Any, ...]:
-    return value if isinstance(value, tuple) else (value,)
 
 
 def _numbers(parameter: Parameter, value: Any, physical: bool) -> Any:

@@ -19,7 +19,6 @@ import numpy as np
 import drivetrain_jax
 from drivetrain_jax._errors import InputError, clipped, counted
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.analysis.atlas import ANALYSIS
 from drivetrain_jax.runs.assemble import misfits, sweep_first
 from drivetrain_jax.runs.axes import Grid, entry_of
 from drivetrain_jax.runs.job import Job, scene_content
@@ -342,7 +341,7 @@ def _of_axes(theirs: Scene, ours: Scene) -> Iterator[str]:
 
 
 def _range(values: np.ndarray, scene: Scene) -> str:
-    if scene.analysis.name == ANALYSIS.name:
+    if scene.analysis.continuous:
         return f"the range from {values[0]:.10g} to {values[-1]:.10g}"
     ends = f"at {values[0]:.10g}" if len(values) == 1 else f"from {values[0]:.10g} to {values[-1]:.10g}"
     return f"{counted(len(values), 'value', 'values')} {ends}"

@@ -449,7 +449,7 @@ def _admitted(described: Parameter, value: Any) -> Any:
             raise InputError(f"{described.name}: missing; allowed is {described.allowed_in_units}")
         return None
     if described.choices or described.text:
-        return _checked(described, value)
+        return described.check(value)
     if described.listed and isinstance(value, (np.ndarray, jax.Array)) and value.ndim == 1:
         value = value if isinstance(value, jax.core.Tracer) else value.tolist()
     if described.listed and isinstance(value, (list, tuple)):
@@ -466,22 +466,15 @@ def _number(described: Parameter, value: Any) -> Any:
         raise InputError(f"{described.name}: a masked value; allowed are numbers, {described.allowed_in_units}")
     if isinstance(value, jax.core.Tracer) or not hasattr(value, "dtype"):
         # A placeholder of a transformation, such as a shape, is no number either.
-        return _checked(described, value) if isinstance(value, _DATA) or hasattr(value, "columns") else value
+        return described.check(value) if isinstance(value, _DATA) or hasattr(value, "columns") else value
     whole = np.asarray(value)
     if whole.dtype.kind not in "iuf":
         raise InputError(
             f"{described.name}: an array of {whole.dtype}; allowed are numbers, {described.allowed_in_units}"
         )
     for extreme in (whole.min(), whole.max()) if whole.size else ():
-        _checked(described, float(extreme))
+        described.check(float(extreme))
     return value if whole.dtype.kind == "f" else whole.astype(float)
-
-
-def _checked(described: Parameter, value: Any) -> Any:
-    try:
-        return described.check(value)
-    except ValueError as error:
-        raise InputError(str(error)) from None
 
 
 def printed(tree: Any) -> str:

@@ -597,6 +597,13 @@ class Shaft(NamedTuple):
         return Shaft(*(None if field is None else aligned(field) for field in fields))
 
 
+def entries_of(value: Any, count: int, none: float = 0.0) -> tuple[Any, ...]:
+    """One entry for each of ``count`` places from a list, one number for all of them, or an empty list."""
+    if not isinstance(value, tuple):
+        return (value,) * count
+    return value or (none,) * count
+
+
 def stack(entries: Any) -> Array:
     """One array from numbers and arrays whose lanes broadcast, shape ``(len(entries), ...)``."""
     if hasattr(entries, "ndim"):

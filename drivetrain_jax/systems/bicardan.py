@@ -19,7 +19,7 @@ import numpy as np
 from drivetrain_jax._errors import InputError, counted
 from drivetrain_jax._quantities import Parameter
 from drivetrain_jax.systems._base import POSITIVE, Conversion, Number, PhysicalData, System, numeric, parameter, serves
-from drivetrain_jax.systems._models import Shaft, stack
+from drivetrain_jax.systems._models import Shaft, entries_of, stack
 
 # Physical data of a bicardanic shaft and the parameters of ``bicardan``, see docs/systems/bicardan.md.
 
@@ -43,10 +43,6 @@ def ring_power(outer: Any, inner: Any, power: int) -> Any:
 
 def _area(outer: Any, inner: Any) -> Any:
     return math.pi / 4 * ring_power(outer, inner, 2)
-
-
-def _second_moment(outer: Any, inner: Any) -> Any:
-    return math.pi / 64 * ring_power(outer, inner, 4)
 
 
 def shear_coefficient(outer: Any, inner: Any, e: Any, g: Any) -> Any:
@@ -80,7 +76,7 @@ PHYSICAL = PhysicalData(
         Conversion(
             "EI",
             (*_SECTION, "E"),
-            lambda outer, inner, e: e * _second_moment(outer, inner),
+            lambda outer, inner, e: e * (math.pi / 64 * ring_power(outer, inner, 4)),
             "pi/64 E (outer_diameter^4 - inner_diameter^4)",
             per="length",
         ),
@@ -136,18 +132,11 @@ def check(fixed: Mapping[str, Any]) -> None:
                     f"{name} = {list(value)}: {counted(len(value), 'entry', 'entries')} where length has {segments}; "
                     f"allowed is one per {what}, {needed}"
                 )
-    mass, rotary = (_entries(fixed.get(name, ()), segments, none) for name, none in (("rhoA", 1.0), ("rhoI", 0.0)))
+    mass, rotary = (entries_of(fixed.get(name, ()), segments, none) for name, none in (("rhoA", 1.0), ("rhoI", 0.0)))
     for i, (each, own) in enumerate(zip(mass, rotary, strict=True)):
         # Traced values are not checked.
         if isinstance(each, (int, float)) and isinstance(own, (int, float)) and each == 0 and own > 0:
             raise ValueError(f"rhoI[{i}] = {own:g}: allowed is 0 for a segment without mass (rhoA[{i}] = 0)")
-
-
-def _entries(value: Any, count: int, none: float) -> tuple[Any, ...]:
-    """One entry for each of ``count`` places from a list, one number for all of them, or an empty list."""
-    if not isinstance(value, tuple):
-        return (value,) * count
-    return value or (none,) * count
 
 
 # Stiffnesses [N m2] and masses per length [kg/m] beyond this range may overflow or underflow on the way to frequencies.
@@ -213,7 +202,7 @@ class Bicardan(System):
         segments = len(length)
 
         def entries(name: str, count: int, none: float) -> tuple[Any, ...]:
-            return _entries(getattr(self, name), count, none)
+            return entries_of(getattr(self, name), count, none)
 
         def unless(items: tuple[Any, ...], none: float) -> Any:
             return None if all(isinstance(x, (int, float)) and x == none for x in items) else stack(items)

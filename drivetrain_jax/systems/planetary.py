@@ -33,7 +33,7 @@ from drivetrain_jax.systems._base import (
     parameter,
     serves,
 )
-from drivetrain_jax.systems._models import Block, DrivenSprings, SpringSystem, weighted_factor
+from drivetrain_jax.systems._models import Block, DrivenSprings, SpringSystem, entries_of, stack, weighted_factor
 
 # Springs, masses and invariant blocks of planetary gears; equation numbers are those of docs/theory/planetary.md.
 
@@ -100,8 +100,7 @@ def _spread(values: Values) -> dict[str, Any]:
     spread_values: dict[str, Any] = {}
     for name, value in complete.items():
         if name in PER_PLANET or name == "planet_angle":
-            whole = value if isinstance(value, tuple) else (value,) * count
-            spread_values[name] = jnp.stack([spread(entry) for entry in whole])
+            spread_values[name] = jnp.stack([spread(entry) for entry in entries_of(value, count)])
         else:
             spread_values[name] = spread(value)
     return spread_values
@@ -330,7 +329,9 @@ def rotational_springs(values: Values) -> SpringSystem:
 def driven_springs(values: Values, springs: SpringSystem) -> DrivenSprings:
     """The gear ``springs`` with transmission errors of its meshes and torques on its bodies, eq (15)."""
     n, names = len(values["planet_angle"]), springs.dofs
-    given = [_entries(values[name], n) for name in ERRORS] + [jnp.asarray(values[f"T_{body}"]) for body in "crs"]
+    given = [stack(entries_of(values[name], n)) for name in ERRORS] + [
+        jnp.asarray(values[f"T_{body}"]) for body in "crs"
+    ]
     lanes = _lanes(springs.mass[0], *(x[0] for x in given[: len(ERRORS)]), *given[len(ERRORS) :])
 
     def spread(array: Array, own: int) -> Array:
@@ -350,12 +351,6 @@ def driven_springs(values: Values, springs: SpringSystem) -> DrivenSprings:
     for body, torque in zip("crs", given[len(ERRORS) :], strict=True):
         force = force.at[names.index(f"u_{body}")].add(spread(torque, 0))
     return DrivenSprings(springs, force)
-
-
-def _entries(value: Any, count: int) -> Array:
-    """A number for all planets, or a list of one number per planet, as an array (count, ...)."""
-    whole = value if isinstance(value, tuple) else (value,) * count
-    return jnp.stack(jnp.broadcast_arrays(*(jnp.asarray(entry, float) for entry in whole)))
 
 
 # Numbers of teeth of a planetary gear and what follows from them, see docs/systems/planetary.md.
@@ -424,7 +419,7 @@ def check(fixed: Mapping[str, Any]) -> None:
 
 
 def _mass(long_name: str, default: float, **more: Any) -> Any:
-    return parameter("kg", long_name, default=default, lower=0.0, open_lower=True, **more)
+    return parameter("kg", long_name, default=default, **POSITIVE, **more)
 
 
 def _stiffness(long_name: str, default: float | None, **more: Any) -> Any:
@@ -437,7 +432,7 @@ def _pressure_angle(long_name: str, **more: Any) -> Any:
 
 
 def _error(units: str, long_name: str, default: float) -> Any:
-    return parameter(units, f"{long_name}", default=default, listed=True, broadcast=True)
+    return parameter(units, long_name, default=default, **_EACH)
 
 
 # Largest angle, two turns: larger numbers are probably degrees.

@@ -19,34 +19,20 @@ import jax.numpy as jnp
 from jax import Array
 
 from drivetrain_jax._quantities import Component, Variable
-from drivetrain_jax.systems._base import Number, System, Values, parameter, serves
+from drivetrain_jax.systems._base import POSITIVE, Number, System, Values, parameter, serves
 from drivetrain_jax.systems._models import Components, FloquetModel, Flow, LinearPeriodic, Rows, cos, sin
 
 # Default parameters from tables 1, 2 and 4 of the paper, and conflicts between them.
 
 
 # Tables 1 and 2: the values that differ between the elements.
+_DIMENSIONS = ("L_B", "L_A", "R", "d_A", "d_C", "S_B", "J_m", "chi_B")
+_OF_ELEMENT = {
+    "input": (0.190, 0.130, 0.070, 0.054, 0.098, 0.0076, 1.4645e-5, 0.22),
+    "output": (0.209, 0.143, 0.077, 0.059, 0.108, 0.0092, 2.1442e-5, 0.24),
+}
 GEOMETRY: Mapping[str, Mapping[str, float]] = {
-    "input": {
-        "L_B": 0.190,
-        "L_A": 0.130,
-        "R": 0.070,
-        "d_A": 0.054,
-        "d_C": 0.098,
-        "S_B": 0.0076,
-        "J_m": 1.4645e-5,
-        "chi_B": 0.22,
-    },
-    "output": {
-        "L_B": 0.209,
-        "L_A": 0.143,
-        "R": 0.077,
-        "d_A": 0.059,
-        "d_C": 0.108,
-        "S_B": 0.0092,
-        "J_m": 2.1442e-5,
-        "chi_B": 0.24,
-    },
+    element: dict(zip(_DIMENSIONS, row, strict=True)) for element, row in _OF_ELEMENT.items()
 }
 # Values of chi_n that the paper states and uses at beta = 9 deg; neither its text nor its formulas yield them.
 STATED_CHI = {"input": 0.0026, "output": 0.0027}
@@ -55,23 +41,20 @@ CHI_SOURCES = ("derived", "printed_formula", "printed_value")
 READINGS = ("octave", "harmonic")
 
 
-SHAPE = ("element", "beta", "chi_n", "chi_source", *GEOMETRY["input"], "rho", "G")
+SHAPE = ("element", "beta", "chi_n", "chi_source", *_DIMENSIONS, "rho", "G")
 _TORQUES = ("M_AEM", "M_MS", "chi_AEM", "chi_MS", "motor_order", "torque_reading", "L_DM2")
 MOTION = (*SHAPE, "zeta", "equation", "excitation_frequency", *_TORQUES, "phi0", "velocity0")
-_SIZE = {"lower": 0.0, "open_lower": True}
 
 
 def of_element(name: str, units: str, long_name: str, *, positive: bool = True, **limits: Any) -> Any:
     """A parameter whose value in the paper depends on the element."""
     values = ", ".join(f"{geometry[name]:g} for the {element}" for element, geometry in GEOMETRY.items())
-    return parameter(
-        units, long_name, derived=values, **({**_SIZE, **limits} if positive else {"lower": 0.0, **limits})
-    )
+    return parameter(units, long_name, derived=values, **{"lower": 0.0, "open_lower": positive, **limits})
 
 
 def positive(units: str, long_name: str, default: float | None = None, **more: Any) -> Any:
     """A parameter greater than 0."""
-    return parameter(units, long_name, default=default, **_SIZE, **more)
+    return parameter(units, long_name, default=default, **POSITIVE, **more)
 
 
 def geometry(values: Values) -> dict[str, Any]:
