@@ -81,9 +81,9 @@ def modes(dataset: xr.Dataset) -> Figure:
     """Frequencies over one axis, coloured by the type of the mode, or the mode shapes of a single point.
 
     A single point without shapes is an interference diagram, if the numbers of teeth are known.
-    Curves follow the stored ``branch``, so colours do not change where frequencies cross or veer; without it every point is
-    a dot. Zero frequencies are not visible on the logarithmic scale. Raises :class:`InputError` for more than one axis, and
-    if needed variables are not stored or have no value.
+    Curves follow the stored ``branch``, so colours do not change where frequencies cross or veer; without it they follow
+    the order of the frequencies. Zero frequencies are not visible on the logarithmic scale. Raises :class:`InputError` for
+    more than one axis, and if needed variables are not stored or have no value.
     """
     names = charts.sweep_axes(dataset)
     if len(names) > 1 or names == ["point"]:
@@ -130,24 +130,14 @@ def _types_over(dataset: xr.Dataset, name: str) -> Figure:
     sheet = Sheet(1 + bool(close), height=4.4 / (1 + bool(close)), sharey=False)
     axes = sheet.axes[0, 0]
     moving = np.where(frequency > _NEGLIGIBLE * np.nanmax(frequency), frequency, np.nan)
-    if "branch" in dataset:
-        order = np.argsort(dataset["branch"].values, axis=1, kind="stable")
-        branches, kinds = (np.take_along_axis(array, order, axis=1) for array in (moving, types))
-        for curve, kind in zip(branches.T, kinds.T, strict=True):
-            points = np.stack([x, curve], axis=-1)
-            # A piece between two points has the colour of its end; snapping to whole pixels would make steps.
-            look = {
-                "colors": [colours[str(k)] for k in kind[1:]],
-                "linewidths": 1.1,
-                "capstyle": "round",
-                "snap": False,
-            }
-            if np.isfinite(curve).any():
-                axes.add_collection(LineCollection([*np.stack([points[:-1], points[1:]], axis=1)], **look))
-    else:
-        for kind, colour in colours.items():
-            rows, numbers = np.nonzero(types == kind)
-            axes.plot(x[rows], moving[rows, numbers], ".", markersize=2.5, color=colour)
+    order = np.argsort(dataset["branch"].values if "branch" in dataset else frequency, axis=1, kind="stable")
+    branches, kinds = (np.take_along_axis(array, order, axis=1) for array in (moving, types))
+    for curve, kind in zip(branches.T, kinds.T, strict=True):
+        points = np.stack([x, curve], axis=-1)
+        # A piece between two points has the colour of its end; snapping to whole pixels would make steps.
+        look = {"colors": [colours[str(k)] for k in kind[1:]], "linewidths": 1.1, "capstyle": "round", "snap": False}
+        if np.isfinite(curve).any():
+            axes.add_collection(LineCollection([*np.stack([points[:-1], points[1:]], axis=1)], **look))
     axes.set(yscale="log", ylim=(0.93 * np.nanmin(moving), 1.07 * np.nanmax(moving)))
     plain_decades(axes, "y")
     labels = [variable_label(dataset["natural_frequency"])]

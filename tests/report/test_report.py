@@ -95,9 +95,8 @@ def test_ranges_of_a_chart_hold_for_all_other_values():
 
 
 def test_few_points_are_tabulated_with_their_places(files):
-    (table,) = values_tables(dt.open_result(files[0]))
-    column = table.head.index("verdict")
-    assert [row[column] for row in table.rows if row[table.head.index("Omega")] == "1.415"] == ["unstable"]
+    ((head, rows),) = values_tables(dt.open_result(files[0]))
+    assert [row[head.index("verdict")] for row in rows if row[head.index("Omega")] == "1.415"] == ["unstable"]
 
 
 TRUCK = {"J1": "2 kg m2", "J2": "0.5 kg m2", "k1": 6e4, "k2": 4e4, "c1": 0.3464, "c2": 0.1414, "angle": "12 deg"}

@@ -54,10 +54,12 @@ def test_branches_keep_colour_and_direction_through_a_crossing():
     np.testing.assert_allclose(slopes[1], -10)
 
 
-def test_without_branches_points_are_dots():
+def test_without_branches_curves_follow_the_order_of_frequencies():
     axes, of = plot(crossing().drop_vars("branch")).axes[0], type_colours(crossing())
-    shown = {to_hex(line.get_color()): line.get_xdata().size for line in axes.lines}
-    assert shown[of["rotational"]] == shown[of["translational"]] == 6
+    below, above = (np.array(curve.get_segments())[:, :, 1] for curve in axes.collections)
+    assert (below <= above).all() and below.max() == 120
+    colours = [{to_hex(colour) for colour in curve.get_colors()} for curve in axes.collections]
+    assert colours == [{of["rotational"], of["translational"]}] * 2
 
 
 def test_a_coupled_branch_has_the_colour_of_its_dominant_family():
