@@ -462,20 +462,17 @@ def maps(
         whole = xr.DataArray(values, attrs=fields[numbers[0]][0].attrs)
         scales[name] = colours(whole, growth_of(rows[0][1][0]) if _is_radius(name) else None)
         sheet.add(*(flag_entries(whole) if flags(whole) else ()))
-    single, titles, meshes = sheet.axes.size == len(rows), [""] * len(rows[0][1]), {}
+    single, meshes = sheet.axes.size == len(rows), {}
+    titles = [[_title(part, titled) for part in parts] for _, parts in rows]
     for k, (row, (name, parts)) in enumerate(zip(fields, rows, strict=True)):
-        above, options = titles, scales[name][0]
-        coordinates = [[part[n] for n in titled if n in part.coords and not part[n].ndim] for part in parts]
-        titles = [", ".join(map(_entry_text, entries)) for entries in coordinates]
+        options = scales[name][0]
         for j, (axes, field, part) in enumerate(zip(sheet.axes[k], row, parts, strict=True)):
             flagged = bool(flags(field))
+            shown = field if flagged else field.clip(options["norm"].vmin, options["norm"].vmax)
+            mesh = draw_cells(axes, shown, *names, **options)
             if not flagged:
-                meshes[name] = draw_cells(
-                    axes, field.clip(options["norm"].vmin, options["norm"].vmax), *names, **options
-                )
+                meshes[name] = mesh
                 sheet.add(*flag_entries(computed(part)))
-            else:
-                draw_cells(axes, field, *names, **options)
             if name == "verdict" or _is_radius(name):
                 sheet.add(*overlays.draw_boundaries(axes, part, *names))
                 if single and k == 0:
@@ -487,8 +484,8 @@ def maps(
             if k == 0:
                 labelled = lines if single else [line for line in lines if line.order == 1]
                 sheet.later(partial(overlays.label_predictions, axes, labelled))
-            if titles != above:
-                axes.set_title(titles[j], pad=24 if k == 0 and lines else 4)
+            if k == 0 or titles[k] != titles[k - 1]:
+                axes.set_title(titles[k][j], pad=24 if k == 0 and lines else 4)
             sheet.add(*_draw_threshold(axes, part, *names))
     # Below the last rows, so that rows of flags without a colour bar keep the whole width.
     for name, mesh in meshes.items():
@@ -524,11 +521,13 @@ def split(parts: Sequence[xr.Dataset], name: str) -> list[tuple[str, list[xr.Dat
     return [(name, [part.isel({own: k}) for part in numbered]) for k in entries] or [(name, list(parts))]
 
 
-def _entry_text(coordinate: xr.DataArray) -> str:
-    """``symbol = value units`` of a parameter, ``driving shaft`` or ``mode 1`` of an entry of another dimension."""
-    if coordinate.dtype.kind == "f":
-        return coordinate_text(coordinate)
-    return entry_name(str(coordinate.name).replace("_", " "), coordinate.item())
+def _title(part: xr.Dataset, names: Sequence[str]) -> str:
+    """``symbol = value units`` of parameters, ``driving shaft`` or ``mode 1`` of entries of another dimension."""
+    shown = [part[name] for name in names if name in part.coords and not part[name].ndim]
+    return ", ".join(
+        coordinate_text(c) if c.dtype.kind == "f" else entry_name(str(c.name).replace("_", " "), c.item())
+        for c in shown
+    )
 
 
 def entry_name(dimension: str, entry: object) -> str:
