@@ -104,9 +104,9 @@ def _draw(motion: xr.Dataset, row: Sequence[Axes], shown: Sequence[str], along: 
 
 def _label(dataset: xr.Dataset, name: str) -> str:
     """``symbol [units]`` of a component or the time, the long name of another coordinate."""
-    known = {c["name"]: c["symbol"] for c in state(dataset)} | {"time": "$t$"}
-    mark = known.get(name) or dataset[name].attrs.get("long_name") if name in dataset.coords else known.get(name)
-    return f"{mark or symbol(name)}{in_brackets(units_of(dataset[name]))}"
+    symbols = {c["name"]: c["symbol"] for c in state(dataset)} | {"time": "$t$"}
+    described = dataset[name].attrs.get("long_name") if name in dataset.coords else ""
+    return f"{symbols.get(name) or described or symbol(name)}{in_brackets(units_of(dataset[name]))}"
 
 
 def _draw_space(motion: xr.Dataset, space: Axes3D, shown: Sequence[str]) -> None:
