@@ -231,8 +231,8 @@ def point(
         # Local import: a point without sensitivities needs no atlas.
         from drivetrain_jax.runs.reply import gradient_lines, point_sensitivities
 
-        data = {name: value for name, (value, _) in found.physical.items()}
-        effects = point_sensitivities(job.scene.system, found.parameters, data) if found.outcome.has_value else None
+        physical = {name: value for name, (value, _) in found.physical.items()}
+        effects = point_sensitivities(job.scene.system, found.parameters, physical) if found.outcome.has_value else None
         found = replace(found, sensitivities=effects or [], _effects=gradient_lines(effects))
     return found if limit is None else replace(found, forced=_forced(found, given, limit))
 
