@@ -115,7 +115,8 @@ class Sheet:
         }
         for columns in range(len(entries) or 1, 0, -1):
             legend = figure.legend(handles=entries, ncols=columns, title=about, **look)
-            if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            # At other resolutions letters are a few percent wider.
+            if columns == 1 or legend.get_window_extent().width <= 0.94 * figure.bbox.width:
                 break
             legend.remove()
         legend.get_title().set_color(FRAME_GREY)
