@@ -17,6 +17,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -172,6 +173,7 @@ _COMMANDS: dict[str, tuple[str, tuple[Any, ...]]] = {
     "status": ("show how much of a scene is computed", (*_SCENE, _JSON)),
     "verify": ("compare all checksums of a result, and apply the rules of its analysis", (
         _file("file", "FILE.nc", "result, finished or not"), _JSON,
+        ("--proof", {"action": "store_true", "help": "compute the proved bounds of an atlas again (seconds)"}),
     )),
     "export": ("write a Zarr store as one HDF5 file, or a result as CSV", (
         _file("store", "RESULT", "a Zarr store, or with --csv any result on a grid"),
@@ -402,6 +404,11 @@ def verify(options: argparse.Namespace) -> int:
     from drivetrain_jax.invariants import verify
 
     report = verify(options.file)
+    if options.proof and not report.problem:
+        from drivetrain_jax.runs.atlas_file import verify_proof
+
+        line, problem = verify_proof(options.file)
+        report = replace(report, lines=(*report.lines, line), problem=problem)
     _answer(report, options)
     if report.problem:
         raise InputError(f"file = {str(options.file)!r}: {report.problem}")

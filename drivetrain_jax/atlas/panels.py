@@ -231,11 +231,11 @@ def to_arrays(atlas: Atlas) -> Arrays:
     """Arrays by name. With p panels, g gaps, d parameters and m values:
 
     ``lower``, ``upper`` (d,): the domain in parameters; ``panel_lower``, ``panel_upper``, ``panel_degrees`` (p, d),
-    ``value_error`` (p,); ``gap_lower``, ``gap_upper`` (g, d), ``gap_reason`` (g,);
+    ``value_error`` (p,), ``proved_error`` (p,) if any is finite; ``gap_lower``, ``gap_upper`` (g, d), ``gap_reason`` (g,);
     ``coefficients`` (c, m): the kept ones, in C order, panel after panel; ``kept``: the bits that mark them
     (``numpy.packbits`` of all panels together).
     """
-    d = len(atlas.parameters)
+    d, proved = len(atlas.parameters), np.array([p.proved_error for p in atlas.panels])
     flat = [p.coefficients.reshape(-1, p.coefficients.shape[-1]) for p in atlas.panels]
     kept = [np.any(c != 0, axis=1) for c in flat]
     m = flat[0].shape[1] if flat else 0
@@ -250,6 +250,7 @@ def to_arrays(atlas: Atlas) -> Arrays:
         "panel_upper": table(atlas.panels, "upper"),
         "panel_degrees": np.array([p.degrees for p in atlas.panels], np.int32).reshape(-1, d),
         "value_error": np.array([p.value_error for p in atlas.panels]),
+        "proved_error": proved if np.isfinite(proved).any() else np.empty(0),
         "gap_lower": table(atlas.gaps, "lower"),
         "gap_upper": table(atlas.gaps, "upper"),
         "gap_reason": np.array([gap.reason for gap in atlas.gaps], dtype=object),
@@ -271,6 +272,7 @@ def from_arrays(
     sizes = np.prod(degrees, axis=1, dtype=int)
     kept = np.unpackbits(np.asarray(arrays["kept"]), count=int(sizes.sum())).astype(bool)
     coefficients = np.asarray(arrays["coefficients"], float)
+    proved = np.broadcast_to(arrays.get("proved_error", math.inf), len(sizes))
     panels, first, used = [], 0, 0
     for k, size in enumerate(sizes):
         mask = kept[first : first + size]
@@ -284,6 +286,7 @@ def from_arrays(
                 np.asarray(arrays["panel_upper"][k]),
                 dense.reshape(*degrees[k], -1),
                 float(arrays["value_error"][k]),
+                float(proved[k]),
             )
         )
     gaps = [

@@ -92,6 +92,7 @@ def _on_grid(path: str, grid: Any, solve: bool) -> xr.Dataset:
     from drivetrain_jax.analysis import OUTCOME
     from drivetrain_jax.runs.assemble import to_dataset
     from drivetrain_jax.runs.atlas_chart import in_physical_units
+    from drivetrain_jax.runs.atlas_file import PROVED
 
     whole = _opened(path, _stamp(path))
     grid, views = _in_atlas_parameters(whole, grid)
@@ -110,6 +111,10 @@ def _on_grid(path: str, grid: Any, solve: bool) -> xr.Dataset:
         data = indexing.LazilyIndexedArray(_Result(cells, name, variable.shape, value.dtype))
         sizes = dict(zip(variable.dims, variable.shape, strict=True))
         dataset[name] = xr.Variable(variable.dims, data, variable.attrs, {"preferred_chunks": sizes | chunks})
+    if "verdict" in dataset:
+        verdict = dataset["verdict"].variable
+        flags = indexing.LazilyIndexedArray(_Result(cells, "proved", verdict.shape, np.dtype(bool)))
+        dataset["proved"] = xr.Variable(verdict.dims, flags, PROVED, verdict.encoding)
     if not solve:
         about = dataset[OUTCOME.name].attrs
         about["flag_values"] = np.arange(gap() + 1, dtype=OUTCOME.dtype)
@@ -243,29 +248,41 @@ class _Cells:
         numbers = {axis: float(column) for axis, column in columns.items() if not column.ndim}
         if not varied:
             return self.points(key, name)
+        if name == "proved":
+            cells = np.meshgrid(*varied.values(), indexing="ij")
+            return self._proved({**numbers, **dict(zip(varied, cells, strict=True))}, self.block(key, "verdict"))
         return self._cached(columns, name, lambda: self.atlas(numbers).arrays(varied, solve=self.solve))
 
     def points(self, positions: Sequence[Any], name: str) -> np.ndarray:
         """The result ``name`` at points, given by their positions along each axis, numbers or arrays of equal shape."""
         columns = {axis: values[part] for (axis, values), part in zip(self.axes.items(), positions, strict=True)}
         shape = next(iter(columns.values())).shape
+        if name == "proved":
+            return self._proved(columns, self.points(positions, "verdict"))
         rows = {axis: column.reshape(-1) for axis, column in columns.items()}
         values = self._cached(columns, name, lambda: self.atlas({}).arrays(rows, zipped=True, solve=self.solve))
         return values.reshape(shape + values.shape[1:])
 
+    def _proved(self, columns: Mapping[str, Any], verdict: np.ndarray) -> np.ndarray:
+        return _opened(self.path, self._stamp).proved({**self.fixed, **columns}, verdict)
+
     def _cached(
         self, columns: Mapping[str, np.ndarray], name: str, evaluate: Callable[[], Mapping[str, np.ndarray]]
     ) -> np.ndarray:
-        """One result of a selection; the other results of the newest selections are kept until they are requested."""
+        """One result of a selection; the other results of the newest selections are kept until they are requested.
+
+        The verdict stays, because the flags of what is proved need it.
+        """
         key = tuple((column.shape, column.tobytes()) for column in columns.values())
-        if (values := self._kept.get(key, {}).pop(name, None)) is None:
+        kept = self._kept.get(key, {})
+        if (values := kept.get(name) if name == "verdict" else kept.pop(name, None)) is None:
             results = {other: np.asarray(values) for other, values in evaluate().items()}
             if not self.solve:
                 from drivetrain_jax.analysis import OUTCOME, Outcome
 
                 outcome = results[OUTCOME.name]
                 results[OUTCOME.name] = np.where(outcome == Outcome.LOST, np.int8(gap()), outcome)
-            values = results.pop(name)
+            values = results[name] if name == "verdict" else results.pop(name)
             if sum(others.nbytes for others in results.values()) <= _BYTES:
                 self._kept = dict([*self._kept.items(), (key, results)][-_SELECTIONS:])
         return values

@@ -243,7 +243,9 @@ def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None)
     columns = {name: np.array([value]) for name, value in point.items()}
     results = {name: values[0] for name, values in atlas.arrays(columns, zipped=True).items()}
     variables = {v.name: v for v in (*atlas.scene.analysis.variables, OUTCOME)}
+    proved = "verdict" in results and bool(atlas.proved(point, results["verdict"]))
     rows = _result_rows(atlas, results, variables)
+    rows += [f"  {'proved':<24} yes"] if proved else []
     slopes = radius_gradient(atlas.scene.system, {**atlas.fixed, **point})
     effects = None if slopes is None else radius_sensitivities(asked, slopes)
     panels, system = atlas.stability.atlas, atlas.scene.system
@@ -262,6 +264,7 @@ def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None)
         "physical": asked.physical(point),
         "values": results,
         "meanings": {n: variables[n].flags[int(v)] for n, v in results.items() if variables[n].flags},
+        "proved": proved,
         **({"growth": grows} if grows else {}),
         "gradient": slopes,
         "sensitivities": [each._asdict() for each in effects or ()],

@@ -16,7 +16,7 @@ from drivetrain_jax._errors import InputError, counted, did_you_mean, shown
 from drivetrain_jax.analysis import OUTCOME, Request, get_analysis
 from drivetrain_jax.analysis._base import make_request
 from drivetrain_jax.analysis.atlas import ANALYSIS
-from drivetrain_jax.atlas import StabilityAtlas, from_arrays, stability_atlas, to_arrays
+from drivetrain_jax.atlas import StabilityAtlas, from_arrays, proof, stability_atlas, to_arrays
 from drivetrain_jax.atlas.floquet import floquet_domain
 from drivetrain_jax.runs.assemble import ResultBuffer, labelled, result_attrs, to_dataset
 from drivetrain_jax.runs.axes import Axis
@@ -87,14 +87,16 @@ _VARIABLES = {
     "panel_upper": (("panel", "parameter"), "upper corner of a panel, in coordinates"),
     "panel_degrees": (("panel", "parameter"), "number of Chebyshev polynomials of a panel"),
     "value_error": (("panel",), "bound of the error of the propagator (Frobenius norm)"),
+    "proved_error": (("panel",), "proved bound of the same, see the attribute theorem; inf without one"),
     "coefficients": (("coefficient", "entry"), "Chebyshev coefficients that are not 0, panel after panel in C order"),
     "kept": (("byte",), "bits that say which coefficients are not 0, of all panels together (most significant first)"),
     "gap_lower": (("gap", "parameter"), "lower corner of a box without a panel, in coordinates"),
     "gap_upper": (("gap", "parameter"), "upper corner of a box without a panel, in coordinates"),
 }
+PROVED = {"units": "1", "long_name": "the verdict is proved"}
 # Every atlas has a domain, and panels, gaps or both.
 _DOMAIN, _GAPS = ("lower", "upper"), ("gap_lower", "gap_upper", "gap_reason")
-_PANELS = tuple(name for name in _VARIABLES if name not in (*_DOMAIN, *_GAPS))
+_PANELS = tuple(name for name in _VARIABLES if name not in (*_DOMAIN, *_GAPS, "proved_error"))
 _ATTRIBUTES = ("scene", "coordinates_of_panels", "tolerance", "solves")
 
 
@@ -118,6 +120,7 @@ def to_labelled(stability: StabilityAtlas, scene: Scene) -> Labelled:
         "tolerance": atlas.tolerance,
         "solves": atlas.solves,
     }
+    attrs |= {"theorem": proof.THEOREM} if atlas.panels and proof.is_proved(atlas) else {}
     return Labelled({**coords, **chart.coords}, {**data, **chart.data}, attrs)
 
 
@@ -283,6 +286,9 @@ class StoredAtlas:
             name: ((*dims, *own[name]), v.values.reshape((*shape, *v.shape[1:])), v.attrs)
             for name, v in found.data_vars.items()
         }
+        if "verdict" in found:
+            verdict = np.asarray(found["verdict"].values)
+            data["proved"] = (dims, self.proved(flat, verdict).reshape(shape), PROVED)
         labels = {dim: whole.coords[dim] for dim in dims if dim in whole.coords}
         given = {name: v if isinstance(v, xr.DataArray) else columns[name] for name, v in checked.items()}
         coords = {name: (v.dims, np.asarray(v.values, float), found[name].attrs) for name, v in given.items()}
@@ -344,6 +350,13 @@ class StoredAtlas:
         """The request of the ``floquet`` analysis: its outputs and options."""
         return Request(self.scene.request.outputs, "atlas", self.scene.request.options)
 
+    def proved(self, columns: Mapping[str, Any], verdict: np.ndarray) -> np.ndarray:
+        """Flags, in the shape of ``verdict``, of the verdicts that are proved; ``columns`` are broadcast to this shape."""
+        given = [np.broadcast_to(np.asarray(columns[name], float), np.shape(verdict)) for name in self.parameters]
+        codes = proof.verdicts(self.stability.atlas, np.stack([column.reshape(-1) for column in given], axis=-1))
+        codes = codes.reshape(np.shape(verdict))
+        return (codes != proof.UNDECIDED) & (codes == verdict)
+
     def direct(self, columns: Mapping[str, np.ndarray], result: str = "spectral_radius") -> np.ndarray:
         """Values ``(N,)`` of a result by direct solves, without the panels; ``columns`` holds all parameters.
 
@@ -403,6 +416,32 @@ class StoredAtlas:
         return Scene(system, floquet, request, columns, zipped, fixed, scene.title, scene.text, scene.data)
 
 
+def verify_proof(path: Path) -> tuple[str, str]:
+    """The result of computing the proved bounds of an atlas file again, in one line, and the problem, empty without one.
+
+    Raises :class:`InputError` as :func:`open_atlas`.
+    """
+    stored = open_atlas(path)
+    atlas, system = stored.stability.atlas, stored.scene.system
+    proved = [panel for panel in atlas.panels if np.isfinite(panel.proved_error)]
+    if not proved:
+        reason = "bounds are proved for the cardan shaft over beta, Omega or both, without strong damping"
+        return "proof: none in this file", f"holds no proof; {reason}"
+    errors = [(proof.proved_error(atlas, panel, system), panel.proved_error) for panel in proved]
+    found, claimed = max(errors, key=lambda pair: pair[0] / pair[1])
+    lines = f"proof: errors of {len(proved)} of {len(atlas.panels)} panels at most {found:.2e}, stored {claimed:.2e}"
+    wrong = f"proved_error = {claimed:.2e}: the proof gives {found:.2e}; allowed is to compute the file again"
+    columns = [np.linspace(*ends, _CELLS) for ends in stored.ranges.values()]
+    points = np.stack([x.reshape(-1) for x in np.meshgrid(*columns, indexing="ij")], axis=-1)
+    codes, given = proof.verdicts(atlas, points), stored.stability.at(points)["verdict"]
+    both = (codes != proof.UNDECIDED) & (given != proof.UNDECIDED)
+    agree = int((both & (codes == given)).sum())
+    line = f"{lines}; {agree} of {codes.size} verdicts of a chart proved"
+    other = int(both.sum()) - agree
+    problem = wrong if found > claimed else f"{other} verdicts contradict the proof; allowed is none" if other else ""
+    return line, problem
+
+
 class AtlasRoute(Route):
     """Builds an atlas; progress counts its solves, which are not points of a grid."""
 
@@ -412,6 +451,7 @@ class AtlasRoute(Route):
     def in_memory(self, job: Job, work: Work, progress: Progress) -> Labelled:
         """The atlas; ``progress`` counts the solves."""
         stability, _ = build_atlas(job.scene, atlas_ranges(job.scene), work, progress)
+        stability = replace(stability, atlas=proof.with_proofs(stability.atlas, job.scene.system))
         return to_labelled(stability, job.scene).with_attrs(**job.attrs)
 
     def into_file(

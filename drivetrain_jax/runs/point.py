@@ -113,7 +113,20 @@ class PointResult:
 
     def to_json(self) -> str:
         """The answer as one JSON object; numbers that are not finite are null."""
-        return self._reply.to_json()
+        reply = self._reply
+        proved = {"proved": self.proved} if "verdict" in self.values else {}
+        return replace(reply, data={**reply.data, **proved}).to_json()
+
+    @property
+    def proved(self) -> bool:
+        """True if the verdict is proved, see [the theory](theory/atlas.md#proved-verdicts): for the cardan shaft, where it
+        is not strongly damped and no multiplier is within rounding of the unit circle."""
+        # Local import: most points need no proof.
+        from drivetrain_jax.atlas.proof import UNDECIDED, verdict_at
+        from drivetrain_jax.systems import get_system
+
+        code = self.values.get("verdict", UNDECIDED)
+        return code != UNDECIDED and verdict_at(get_system(self.system), self.parameters) == code
 
     def __repr__(self) -> str:
         return self._reply.text
