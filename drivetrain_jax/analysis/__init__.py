@@ -26,13 +26,13 @@ _BUILT_IN = {
     "frequency_response": "frequency_response.analysis:ANALYSIS",
     "history": "history.analysis:ANALYSIS",
     "lyapunov": "lyapunov.analysis:ANALYSIS",
-    "poincare": "poincare.analysis:ANALYSIS",
+    "poincare": "poincare:ANALYSIS",
     "parameters": "constants:PARAMETERS",
     "phasing": "constants:PHASING",
-    "modes": "modes.analysis:ANALYSIS",
-    "harmonic_response": "harmonic_response.analysis:ANALYSIS",
-    "steady_state": "steady_state.analysis:ANALYSIS",
-    "basins": "basins.analysis:ANALYSIS",
+    "modes": "modes:ANALYSIS",
+    "harmonic_response": "harmonic_response:ANALYSIS",
+    "steady_state": "steady_state:ANALYSIS",
+    "basins": "basins:ANALYSIS",
     "critical_speeds": "critical_speeds.analysis:ANALYSIS",
 }
 

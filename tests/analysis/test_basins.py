@@ -6,7 +6,7 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.analysis.basins.analysis import shares
+from drivetrain_jax.analysis.basins import shares
 from drivetrain_jax.systems.rattle import PRESETS
 
 # Share of the high branch by omega, for initial conditions in [-1, 1]^2.

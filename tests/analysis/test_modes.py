@@ -11,7 +11,7 @@ import xarray as xr
 from scipy.optimize import brentq
 
 import drivetrain_jax as dt
-from drivetrain_jax.analysis.modes.analysis import SYMMETRIC, follow
+from drivetrain_jax.analysis.modes import SYMMETRIC, follow
 from tests.oracles.planetary_reference import TABLE_2, exact_frequencies, matrices, natural_frequencies
 
 RIGID, ROTATIONAL, TRANSLATIONAL, PLANET, COUPLED = range(5)

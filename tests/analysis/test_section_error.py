@@ -10,7 +10,7 @@ from scipy.linalg import expm
 
 from drivetrain_jax.analysis.lyapunov.growth_record import discarded, sampled
 from drivetrain_jax.analysis.lyapunov.variational import initial_state
-from drivetrain_jax.analysis.poincare.analysis import EARLY, Steps, section_errors
+from drivetrain_jax.analysis.poincare import EARLY, Steps, section_errors
 
 DAMPING, STIFFNESS, TORQUE = [0.0, 0.01, 2.0], 20.0, 1.0
 FIRST, COUNT = 200, 300

@@ -76,7 +76,7 @@ LIMITS = {
     "lyapunov": ("lyapunov.analysis", "MOST_WORK", 1.0, dt.lyapunov, dt.Tripod(**SHAFT), {"max_time": 0.0417}),
     "history": ("history.integration", "_STROBES", 1.0, dt.history, dt.Tripod(**SHAFT), {"stop": 0.0417, "num": 3}),
     "poincare": (
-        "poincare.analysis", "_MEAN_STEPS", 0, dt.poincare, dt.Tripod(**SHAFT),
+        "poincare", "_MEAN_STEPS", 0, dt.poincare, dt.Tripod(**SHAFT),
         {"method": "adaptive", "strobes": 419, "rtol": 1e-11},
     ),
     "floquet": (

@@ -22,7 +22,7 @@ from jax import Array
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
-from drivetrain_jax.analysis.modes.analysis import described, is_rigid, largest_frequency, system_modes
+from drivetrain_jax.analysis.modes import described, is_rigid, largest_frequency, system_modes
 from drivetrain_jax.analysis.numerics.lanes import lane_count
 from drivetrain_jax.systems import DrivenSprings, System
 

@@ -25,7 +25,7 @@ from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.impacts.attractor import attractors, take
 from drivetrain_jax.analysis.impacts.exact_response import WIDTH, describe
 from drivetrain_jax.analysis.impacts.motion import from_scaled_length, to_scaled_length
-from drivetrain_jax.analysis.steady_state.analysis import WAIT
+from drivetrain_jax.analysis.steady_state import WAIT
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System
 
 ATTRACTORS = 8

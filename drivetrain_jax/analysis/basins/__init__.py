@@ -1,1 +1,0 @@
-"""Basins of attraction of oscillators with play."""

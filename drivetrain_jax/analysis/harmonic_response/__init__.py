@@ -1,1 +1,0 @@
-"""Steady vibration under harmonic forces."""

@@ -1,1 +1,0 @@
-"""Modes of discrete systems: frequencies, types, tracking, gradients."""

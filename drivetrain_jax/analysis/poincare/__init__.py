@@ -1,1 +1,0 @@
-"""Poincare sections and their errors."""

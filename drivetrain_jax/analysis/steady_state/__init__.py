@@ -1,1 +1,0 @@
-"""Steady states of oscillators with play."""
