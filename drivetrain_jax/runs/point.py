@@ -119,8 +119,8 @@ class PointResult:
 
     @property
     def proved(self) -> bool:
-        """True if the verdict is proved, see [the theory](theory/atlas.md#proved-verdicts): for the cardan shaft, where it
-        is not strongly damped and no multiplier is within rounding of the unit circle."""
+        """True if the verdict is proved (docs/theory/atlas.md): for the cardan shaft, where it is not strongly damped and no
+        multiplier lies within rounding of the unit circle."""
         # Local import: most points need no proof.
         from drivetrain_jax.atlas.proof import UNDECIDED, verdict_at
         from drivetrain_jax.systems import get_system
