@@ -53,7 +53,7 @@ GUESSES = [
     (f"{POINT} --amplitude -2deg", "--amplitude: expected one argument"),
     (f"{RUN} --threads 0", "threads = 0"),
     ("run scene.toml --out q.csv", "allowed is a name that ends in .nc or .zarr"),
-    ("run scene.toml --out q.zar", "(did you mean .zarr?)"),
+    ("run scene.toml --out q.zr", "(did you mean .zarr?)"),
     ("run scene.toml --out ~/nowhere/at/all/r.nc", "does not exist; allowed is a file in an existing folder"),
     ("run quickstrt --out r.nc", "did you mean quickstart?"),
     ("run cardan --out r.nc", "give the path of a scene file"),
