@@ -507,8 +507,9 @@ def point(options: argparse.Namespace) -> int:
     asked = {"amplitude": options.amplitude, "sensitivities": options.sensitivities, "data": options.data}
     for name in ("system", "analysis", *asked):
         if name in given:
-            place = f"did you mean the option --{name}?" if name in asked else "allowed is once, in front of the values"
-            raise InputError(f"{name} = {given[name]!r}: not a parameter; {place}")
+            option = f"not a parameter; did you mean the option --{name}?"
+            twice = "given twice; allowed is once, in front of the values"
+            raise InputError(f"{name} = {given[name]!r}: {option if name in asked else twice}")
     outputs = given.pop("outputs", None)
     if isinstance(outputs, str):
         outputs = outputs.split(",")

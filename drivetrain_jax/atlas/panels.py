@@ -272,7 +272,8 @@ def from_arrays(
     sizes = np.prod(degrees, axis=1, dtype=int)
     kept = np.unpackbits(np.asarray(arrays["kept"]), count=int(sizes.sum())).astype(bool)
     coefficients = np.asarray(arrays["coefficients"], float)
-    proved = np.broadcast_to(arrays.get("proved_error", math.inf), len(sizes))
+    proved = np.asarray(arrays.get("proved_error", ()))
+    proved = proved if proved.size else np.full(len(sizes), math.inf)
     panels, first, used = [], 0, 0
     for k, size in enumerate(sizes):
         mask = kept[first : first + size]

@@ -210,6 +210,7 @@ def test_arrays_and_back():
     assert len(arrays["coefficients"]) < sum(np.prod(panel.degrees) for panel in atlas.panels)
     for a, b in zip(atlas.panels, again.panels, strict=True):
         assert np.array_equal(a.coefficients, b.coefficients) and a.value_error == b.value_error
+        assert a.proved_error == b.proved_error == np.inf
     assert np.array_equal(values(again, sample(SQUARE))[0], values(atlas, sample(SQUARE))[0])
 
 

@@ -258,7 +258,7 @@ WRONG_RUNS = {
         ["--fresh"],
         "not a result of",
     ),
-    "result is the scene": (None, ["--out", "scene.toml", "--fresh"], "out = 'scene.toml': a result is a netCDF file"),
+    "result is the scene": (None, ["--out", "scene.toml", "--fresh"], "out = 'scene.toml': a result is netCDF or Zarr"),
     "name too long": (None, ["--out", "r" * 300], "rrrr: File name too long"),
     "name of the parts too long": (None, ["--out", "r" * 252], "(with '.parts')"),
     "no folder can be made": (None, ["--out", "/proc/r.nc"], "a path in a writable folder"),
