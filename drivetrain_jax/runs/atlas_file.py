@@ -425,7 +425,9 @@ def verify_proof(path: Path) -> tuple[str, str]:
     atlas, system = stored.stability.atlas, stored.scene.system
     proved = [panel for panel in atlas.panels if np.isfinite(panel.proved_error)]
     if not proved:
-        reason = "bounds are proved for the cardan shaft over beta, Omega or both, without strong damping or very low speeds"
+        reason = (
+            "bounds are proved for the cardan shaft over beta, Omega or both, without strong damping or very low speeds"
+        )
         return "proof: none in this file", f"holds no proof; {reason}"
     errors = [(proof.proved_error(atlas, panel, system), panel.proved_error) for panel in proved]
     found, claimed = max(errors, key=lambda pair: pair[0] / pair[1])
