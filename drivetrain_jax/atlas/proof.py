@@ -110,8 +110,8 @@ class _Lines:
 
     def __init__(self, c: np.ndarray, values: Mapping[str, float], largest: float, count: int) -> None:
         self.c, self.largest = c, largest
-        self.zeta, self.alpha, self.mu = (float(values[name]) for name in ("zeta", "alpha", "mu"))
-        self.g = float(values["gamma"]) ** -0.5
+        self.zeta, self.alpha, self.mu = (np.float64(values[name]) for name in ("zeta", "alpha", "mu"))
+        self.g = np.float64(values["gamma"]) ** -0.5
         r = (1 - c) / (1 + c)
         # Equal parts of the clock psi, eq. (12).
         psi = np.linspace(0, math.pi / 2, count + 1)[:, None]

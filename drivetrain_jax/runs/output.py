@@ -277,7 +277,7 @@ class Output:
 
     @property
     def obstacle(self) -> str:
-        """What a run would replace."""
+        """The present file or folder that a run would replace, in words."""
         what = self._damage or (self._found.what if isinstance(self._found, Damaged) else "")
         if what:
             return f"a damaged result ({what})"

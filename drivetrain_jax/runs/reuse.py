@@ -201,7 +201,7 @@ def _within(scene: Scene, grid: Grid, other: Scene, points: Grid) -> tuple[np.nd
 
 
 def _line(grid: Grid) -> tuple[Any, ...]:
-    """What identifies the path of a grid."""
+    """The identity of the path of a grid, empty without one."""
     return () if grid.path is None else (grid.path.name, grid.path.values.tolist(), grid.path_is_fixed)
 
 

@@ -213,6 +213,14 @@ def test_nothing_is_proved_where_the_proof_does_not_hold(chart):
     assert (proof.verdicts(chart.atlas, np.array([[1.3, 1.0], [0.5, 2.1]])) == 2).all()
 
 
+@pytest.mark.parametrize("value", [1e-300, 1e300])
+@pytest.mark.parametrize("name", ["zeta", "alpha", "mu", "gamma", "Omega"])
+def test_extreme_parameters_are_no_error(name, value):
+    """A heavy driven disk is unstable: direct solves give a radius of 1.011413 for gamma from 1e8 to 1e300."""
+    found = proof.verdict_at(CARDAN, {**BASE, "beta": 0.3, "Omega": 1.4, name: value})
+    assert found == 1 if (name, value) == ("gamma", 1e300) else found in (0, 2)
+
+
 def test_middles_determine_the_balance(chart):
     """T and S of the proof are those of the construction."""
     from drivetrain_jax.atlas.floquet import balanced_entries, floquet_domain

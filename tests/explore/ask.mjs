@@ -52,7 +52,7 @@ const questions = {
   nearest: (atlas, ...values) => answer(atlas, { values: values.map(Number), distances: true }),
 };
 
-/** As many bytes pass through the processor as in a chart: a chain of products and sums over two arrays of 2 MB, 80 times. */
+/** Products and sums over two arrays of 2 MB, 80 times: as long as a chart, and as much memory. */
 const [left, right] = [new Float64Array(1 << 18).fill(0.5), new Float64Array(1 << 18).fill(0.999)];
 function loop() {
   for (let k = 0; k < 80; k++) for (let i = 1; i < left.length; i++) left[i] = left[i] * right[i] + 1e-7 * left[i - 1];
