@@ -15,7 +15,7 @@ from drivetrain_jax.analysis import get_analysis
 from drivetrain_jax.invariants import check
 from drivetrain_jax.systems import get_system
 
-POINTS, MANY = 32, 2048
+POINTS, MANY = 32, 512
 # Largest size: numbers that have squares and fourth powers.
 LARGEST = 1e20
 STEEP = np.nextafter(math.pi / 2, 0.0)

@@ -196,4 +196,4 @@ def test_no_order_of_events_gives_a_wrong_value(machine):
 @pytest.mark.parametrize("machine", [ResumeMachine, StoreMachine])
 def test_no_long_order_of_events_gives_a_wrong_value(machine):
     pytest.importorskip("zarr")
-    run_state_machine_as_test(machine, settings=settings(max_examples=40, stateful_step_count=20, **HOW))
+    run_state_machine_as_test(machine, settings=settings(max_examples=20, stateful_step_count=20, **HOW))
