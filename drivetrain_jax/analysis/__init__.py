@@ -73,12 +73,12 @@ def get_analysis(name: str) -> Analysis:
         return getattr(import_module(f"{__name__}.{module}"), record)
     from drivetrain_jax.analysis._base import Analysis
 
-    found = load_plugin(ANALYSES, name, "an analysis", lambda x: isinstance(x, Analysis))
-    if found is None:
+    analysis = load_plugin(ANALYSES, name, "an analysis", lambda x: isinstance(x, Analysis))
+    if analysis is None:
         raise KeyError(f"analysis = {name!r}: allowed is one of {', '.join(analysis_names())}")
-    if found.uses and found.uses not in analysis_names():
-        raise ImportError(f"uses = {found.uses!r}: no analysis{nearest(found.uses, analysis_names())}")
-    return found
+    if analysis.uses and analysis.uses not in analysis_names():
+        raise ImportError(f"uses = {analysis.uses!r}: no analysis{nearest(analysis.uses, analysis_names())}")
+    return analysis
 
 
 def analyses_of(system: type[System]) -> tuple[str, ...]:
@@ -96,10 +96,10 @@ def analyses_of(system: type[System]) -> tuple[str, ...]:
 
 def broken_analyses() -> dict[str, str]:
     """The reasons why analyses of installed packages cannot be used, by name."""
-    found = {}
+    reasons = {}
     for name in plugin_names(ANALYSES):
         try:
             get_analysis(name)
         except ImportError as error:
-            found[name] = " ".join(str(error).split())
-    return found
+            reasons[name] = " ".join(str(error).split())
+    return reasons

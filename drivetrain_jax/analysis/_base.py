@@ -103,15 +103,15 @@ def finite_results(
         missing |= False if name in infinite else jnp.isinf(x)
         return jnp.any(missing, axis=tuple(range(path, path + x.ndim - outcome.ndim)))
 
-    broken = reduce(jnp.logical_or, (lost(*each) for each in real.items()), jnp.zeros(outcome.shape, bool))
+    broken = reduce(jnp.logical_or, (lost(*item) for item in real.items()), jnp.zeros(outcome.shape, bool))
     broken &= outcome < Outcome.NOT_CONVERGED
 
     def kept(x: Array) -> Array:
         axes = tuple(range(path, path + x.ndim - outcome.ndim))
         return jnp.where(jnp.expand_dims(broken, axes), jnp.nan, x)
 
-    found = {name: kept(x) for name, x in real.items()}
-    return {**results, **found, OUTCOME.name: jnp.where(broken, jnp.int8(Outcome.NOT_FINITE), outcome)}
+    kept_values = {name: kept(x) for name, x in real.items()}
+    return {**results, **kept_values, OUTCOME.name: jnp.where(broken, jnp.int8(Outcome.NOT_FINITE), outcome)}
 
 
 def stacked(jacobian: Any) -> Array:
@@ -121,9 +121,9 @@ def stacked(jacobian: Any) -> Array:
 
 def in_time_of(system: type[System], quantities: tuple[Quantity, ...]) -> tuple[Quantity, ...]:
     """``quantities`` in s and 1/s, in the unit of time of ``system`` instead."""
-    own = system.unit_of_time()
-    units = {"s": own, "1/s": f"1/{own}"}
-    return tuple(replace(each, units=units.get(each.units, each.units)) for each in quantities)
+    second = system.unit_of_time()
+    units = {"s": second, "1/s": f"1/{second}"}
+    return tuple(replace(quantity, units=units.get(quantity.units, quantity.units)) for quantity in quantities)
 
 
 def forward_derivatives(
@@ -230,8 +230,8 @@ class Analysis:
 # Cached, because kernels are cached by the identity of the analysis.
 @lru_cache(maxsize=256)
 def _for_system(analysis: Analysis, system: type[System]) -> Analysis:
-    own = analysis.of_system(system)
-    return replace(analysis, **own) if own else analysis
+    declared = analysis.of_system(system)
+    return replace(analysis, **declared) if declared else analysis
 
 
 def make_request(
@@ -275,14 +275,14 @@ def dimensions_of(
     analysis: Analysis, system: type[System], request: Request, fixed: Mapping[str, Any]
 ) -> tuple[Dimension, ...]:
     """The dimensions of the results; :class:`InputError` if a requested result has another one."""
-    found = analysis.dimensions(system, request, fixed)
-    known = [each.name for each in found]
+    dimensions = analysis.dimensions(system, request, fixed)
+    known = [dimension.name for dimension in dimensions]
     # The outputs of a continuous analysis are evaluated later, from its own results.
     for name in () if analysis.continuous else request.outputs:
         for dim in analysis.variable(name).dims:
             if dim not in known:
                 raise InputError(f"analysis {analysis.name}: {name} has the dimension {dim!r}{nearest(dim, known)}")
-    return found
+    return dimensions
 
 
 def checked_solvers(
@@ -313,19 +313,19 @@ class _CheckedSolve:
     solve: Callable[[Mapping[str, Any], Array], dict[str, Array]]
 
     def __call__(self, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
-        found: Any = self.solve(values, effort)
+        results: Any = self.solve(values, effort)
         wanted = (*(self.analysis.variable(name) for name in self.request.outputs), OUTCOME)
         names = [variable.name for variable in wanted]
-        if not isinstance(found, Mapping):
-            raise self._error(f"solve returned {type(found).__name__}; allowed is a dict of {', '.join(names)}")
+        if not isinstance(results, Mapping):
+            raise self._error(f"solve returned {type(results).__name__}; allowed is a dict of {', '.join(names)}")
         declared = [*(variable.name for variable in self.analysis.variables), OUTCOME.name]
-        for name in found:
+        for name in results:
             if name not in declared:
                 raise self._error(f"solve returned {name!r}, which is not declared{nearest(str(name), declared)}")
         for name in names:
-            if name not in found:
-                raise self._error(f"solve returned {', '.join(found)}, not {name}; allowed is {', '.join(names)}")
-        return {variable.name: self._checked(variable, found[variable.name]) for variable in wanted}
+            if name not in results:
+                raise self._error(f"solve returned {', '.join(results)}, not {name}; allowed is {', '.join(names)}")
+        return {variable.name: self._checked(variable, results[variable.name]) for variable in wanted}
 
     def _checked(self, variable: Variable, value: Any) -> Array:
         dims = [*(["path"] if self.path else []), *variable.dims]
@@ -346,27 +346,27 @@ class _CheckedSolve:
 
 
 def _method_and_options(
-    analysis: Analysis, given: dict[str, Any], lacking: Mapping[str, str]
+    analysis: Analysis, options: dict[str, Any], lacking: Mapping[str, str]
 ) -> tuple[str, dict[str, Any]]:
     methods = [name for name in analysis.methods if name not in lacking]
-    method = given.pop("method", next(iter(analysis.methods)))
+    method = options.pop("method", next(iter(analysis.methods)))
     if isinstance(method, str):
         method = analysis.aliases.get(method, method)
     if not isinstance(method, str) or method not in analysis.methods:
         raise InputError(f"options.method = {shown(method)}: unknown{nearest(str(method), methods)}")
     used = analysis.methods[method]
-    for key, value in given.items():
+    for key, value in options.items():
         if key not in used:
             others = [name for name in methods if key in analysis.methods[name]]
             guess = f", but by {', '.join(others)}" if others else did_you_mean(key, ("method", *used))
             allowed = f"allowed is {', '.join(('method', *used))}"
             raise InputError(f"options.{key} = {shown(value)}: not used by method {method}{guess}; {allowed}")
-    return method, {o.name: _option(o, given) for o in analysis.options if o.name in used}
+    return method, {o.name: _option(o, options) for o in analysis.options if o.name in used}
 
 
-def _option(option: Parameter, given: Mapping[str, Any]) -> Any:
-    if option.name in given:
-        return checked(option, given[option.name], "options.")
+def _option(option: Parameter, options: Mapping[str, Any]) -> Any:
+    if option.name in options:
+        return checked(option, options[option.name], "options.")
     if option.default is None and not option.derived:
         raise InputError(f"options.{option.name}: missing; allowed is {option.allowed}")
     return option.default

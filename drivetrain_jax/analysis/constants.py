@@ -26,11 +26,11 @@ def _solve(
     name: str, system: type[System], request: Request, values: Mapping[str, Any], effort: Array
 ) -> dict[str, Array]:
     model = system.models[name]
-    own = {v.name for v in model.results if v.dims}
+    with_axis = {v.name for v in model.results if v.dims}
     constants, with_modes = model.build(values), {v.name for v in model.results if v.dims == (MODE,)}
 
     def value(name: str) -> Array:
-        if name not in own:
+        if name not in with_axis:
             return jnp.asarray(constants[name], float)
         listed = constants[name]
         if name in with_modes:
@@ -38,7 +38,7 @@ def _solve(
         return jnp.stack(jnp.broadcast_arrays(*(jnp.asarray(x, float) for x in listed)))
 
     results = {name: value(name) for name in request.outputs}
-    finite = [jnp.all(jnp.isfinite(x if name in own else x[None]), axis=0) for name, x in results.items()]
+    finite = [jnp.all(jnp.isfinite(x if name in with_axis else x[None]), axis=0) for name, x in results.items()]
     whole = jnp.stack(jnp.broadcast_arrays(*finite))
     outcome = jnp.where(jnp.all(whole, axis=0), Outcome.SUCCESS, Outcome.NOT_FINITE)
     # An infinite constant has no value.

@@ -39,13 +39,13 @@ def _solve(system: type[System], request: Request, values: Mapping[str, Any], ef
     shapes = weight[:, None] * modes.vectors  # pyright: ignore[reportOperatorIssue]
     driven = jnp.sum(shapes * _in_lanes(model.force, lanes)[:, None], axis=0)
     # The computed frequency of a rigid mode is rounding.
-    own = jnp.where(is_rigid(modes.frequency, largest_frequency(model.springs, lanes)), 0.0, modes.frequency)
+    natural = jnp.where(is_rigid(modes.frequency, largest_frequency(model.springs, lanes)), 0.0, modes.frequency)
     omega = 2 * math.pi * jnp.asarray(_frequencies(request))[:, None, None]
-    gain = driven / (own**2 - omega**2 + 2j * damping * own * omega)
+    gain = driven / (natural**2 - omega**2 + 2j * damping * natural * omega)
     response = jnp.einsum("dnl,fnl->fdl", shapes, gain)
     finite = jnp.isfinite(response)
-    found = {"amplitude": jnp.abs(response), "phase": jnp.angle(response)}
-    results = {name: jnp.where(finite & modes.found, found[name], jnp.nan) for name in request.outputs}
+    polar = {"amplitude": jnp.abs(response), "phase": jnp.angle(response)}
+    results = {name: jnp.where(finite & modes.found, polar[name], jnp.nan) for name in request.outputs}
     missing = jnp.where(modes.found, Outcome.NOT_FINITE, Outcome.NOT_CONVERGED)
     outcome = jnp.where(modes.found & jnp.all(finite, axis=(0, 1)), Outcome.SUCCESS, missing)
     return results | {"outcome": outcome.astype(jnp.int8)}

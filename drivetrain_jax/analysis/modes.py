@@ -160,13 +160,13 @@ def block_modes(block: Block, largest: Array, asymmetry: Array, families: int) -
     vectors, vectors_found = jacobi_vectors(block.factor)
     vectors = _rising(block.factor, vectors)
     rounding = jnp.broadcast_to(_ROUNDINGS * EPS * largest, frequency[1:].shape)
-    own = _turned(block, vectors, clusters(frequency, rounding), np.where(block.polar, _POLARISATION, 0.0))
+    separated = _turned(block, vectors, clusters(frequency, rounding), np.where(block.polar, _POLARISATION, 0.0))
     relative = jnp.where(asymmetry <= SYMMETRIC, _CLUSTER_IF_SYMMETRIC, CLUSTER)
     named = vectors
     if len(set(block.family)) > 1:
         named = _turned(block, vectors, clusters(frequency, jnp.maximum(relative * frequency[1:], rounding)), 0.0)
-    share, label = _participation(block, own, families), _label(_participation(block, named, families))
-    return BlockModes(frequency, own, share, label, values_found & vectors_found)
+    share, label = _participation(block, separated, families), _label(_participation(block, named, families))
+    return BlockModes(frequency, separated, share, label, values_found & vectors_found)
 
 
 def _rising(factor: Array, vectors: Array) -> Array:
@@ -283,8 +283,8 @@ def _spectrum(build: Build, method: str, values: Mapping[str, Any], lanes: int) 
         factors = (_in_lanes(block.factor, count) for block in _blocks(build(part), method))
         return bidiagonal_form(*factors)
 
-    found_values, found = bidiagonal_values(in_blocks(reduce, values, lanes, _lanes_at_a_time(sample)))
-    return jnp.sort(jnp.repeat(found_values, copies, axis=0, total_repeat_length=copies.sum()), axis=0), found
+    values_of_blocks, complete = bidiagonal_values(in_blocks(reduce, values, lanes, _lanes_at_a_time(sample)))
+    return jnp.sort(jnp.repeat(values_of_blocks, copies, axis=0, total_repeat_length=copies.sum()), axis=0), complete
 
 
 def _first_lane(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -364,8 +364,8 @@ def _results(build: Build, request: Request, values: Mapping[str, Any], lanes: i
     wanted = set(request.outputs)
     followed = bool(request.options["track"])
     if wanted <= _SPECTRUM:
-        frequency, found = _spectrum(build, request.method, values, lanes)
-        return _frequencies(frequency, found, None)
+        frequency, complete = _spectrum(build, request.method, values, lanes)
+        return _frequencies(frequency, complete, None)
     shapes = bool(wanted & {"mode_shape", "kinetic_energy"}) or followed
 
     def compute(part: Mapping[str, Any], count: int) -> dict[str, Array]:
@@ -400,17 +400,17 @@ def _by_body(vectors: Array, bodies: np.ndarray) -> Array:
     return jnp.stack([jnp.sum(vectors[bodies == body] ** 2, axis=0) for body in range(bodies.max() + 1)], axis=1)
 
 
-def _frequencies(frequency: Array, found: Array, participation: Array | None) -> dict[str, Array]:
+def _frequencies(frequency: Array, complete: Array, participation: Array | None) -> dict[str, Array]:
     """Frequency, its error and outcome; NaN for missing modes."""
-    value = jnp.where(found, frequency / (2 * math.pi), jnp.nan)
+    value = jnp.where(complete, frequency / (2 * math.pi), jnp.nan)
     # Backward error of orthogonal transformations, equal for all modes of a point; true errors are about a tenth of it.
     error = 4 * EPS * math.sqrt(frequency.shape[0]) * value[-1]
     results = {"natural_frequency": value, "natural_frequency_error": jnp.broadcast_to(error, value.shape)}
     if participation is not None:
-        results["participation"] = jnp.where(found, participation, jnp.nan)
+        results["participation"] = jnp.where(complete, participation, jnp.nan)
     finite = jnp.all(jnp.isfinite(frequency), axis=0)
     missing = jnp.where(finite, Outcome.NOT_CONVERGED, Outcome.NOT_FINITE)
-    return results | {"outcome": jnp.where(found, Outcome.SUCCESS, missing).astype(jnp.int8)}
+    return results | {"outcome": jnp.where(complete, Outcome.SUCCESS, missing).astype(jnp.int8)}
 
 
 def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
@@ -429,7 +429,7 @@ def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Ar
     if _FOLLOWED & set(request.outputs):
         order, place = _along(np.asarray(along))
         followed = follow(results["vectors"][order], results["equal"][order])
-        results["branch"], results["mac"] = (each[place] for each in followed)
+        results["branch"], results["mac"] = (values_along[place] for values_along in followed)
     return {name: results[name] for name in wanted}
 
 
@@ -452,9 +452,9 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
 def described(model: Model, fixed: Mapping[str, Any]) -> Any:
     """The object that ``model`` builds, traced only: its names and sizes do not depend on varying parameters."""
     values = {name: fixed.get(name, 1.0) for name in model.parameters}
-    found: list[Any] = []
-    jax.eval_shape(lambda: found.append(model.build(values)))
-    return found[0]
+    models: list[Any] = []
+    jax.eval_shape(lambda: models.append(model.build(values)))
+    return models[0]
 
 
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:

@@ -75,11 +75,11 @@ def orbit_jacobians(
     def motion(x: Array) -> dict[str, Array]:
         oscillator, u, v = replace(scaled, **dict(zip(_FIELDS, x[:-2], strict=True))), x[-2:-1], x[-1:]
         seen = measure(oscillator, u, v, multiple[None], width=1, integrals=not INTEGRALS.isdisjoint(names))
-        found = {name: value[..., 0] for name, value in periodic_results(oscillator, seen).items() if name in names}
+        values = {name: value[..., 0] for name, value in periodic_results(oscillator, seen).items() if name in names}
         if not {"u_history", "v_history"}.isdisjoint(names):
             sampled = history(oscillator, u, v, multiple[None], samples)
-            found |= dict(zip(("u_history", "v_history"), (x[:, 0] for x in sampled), strict=True))
-        return found | {"end": jnp.stack(seen.end)[:, 0]}
+            values |= dict(zip(("u_history", "v_history"), (x[:, 0] for x in sampled), strict=True))
+        return values | {"end": jnp.stack(seen.end)[:, 0]}
 
     moved = jax.jacfwd(motion)(jnp.concatenate([_vector(scaled), start]))
     end = moved.pop("end")
@@ -159,8 +159,8 @@ def _solve(
     model, unit = to_scaled_length(model)
     u0, v0 = (jnp.broadcast_to(jnp.asarray(x, float) / unit, (count,)) for x in start)
     route = jnp.arange(count, dtype=jnp.int32)[:, None]
-    found = attractors(model, route, u0, v0, most_periods=request.options["most_periods"], width=WIDTH)
-    flat = jax.tree.map(lambda x: x[:, 0], found)
+    motions = attractors(model, route, u0, v0, most_periods=request.options["most_periods"], width=WIDTH)
+    flat = jax.tree.map(lambda x: x[:, 0], motions)
     integrals = not INTEGRALS.isdisjoint(request.outputs)
     largest = np.finfo(float).max / jnp.maximum(unit, 1.0)
     results = describe(model, flat, rtol=request.options["rtol"], integrals=integrals, largest=largest)

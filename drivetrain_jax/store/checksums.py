@@ -98,8 +98,8 @@ def damaged(path: Path) -> list[str] | None:
         stored = file.attrs.get(ATTRIBUTE)
         if stored is None:
             return None
-        wanted, found = _parsed(stored), checksums(file)
-    return sorted(name for name in {*wanted, *found} if wanted.get(name) != found.get(name))
+        wanted, present = _parsed(stored), checksums(file)
+    return sorted(name for name in {*wanted, *present} if wanted.get(name) != present.get(name))
 
 
 def refuse_damaged(path: Path, *, rewritten: bool = False) -> None:
@@ -127,11 +127,11 @@ def named(names: list[str]) -> str:
 
 def _variables(file: h5py.File) -> dict[str, h5py.Dataset]:
     # A file may also contain the named type of its complex numbers.
-    return {name: found for name in sorted(file) if isinstance(found := file[name], h5py.Dataset)}
+    return {name: variable for name in sorted(file) if isinstance(variable := file[name], h5py.Dataset)}
 
 
 def _groups(file: h5py.File) -> dict[str, h5py.Group]:
-    return {name: found for name in sorted(file) if isinstance(found := file[name], h5py.Group)}
+    return {name: group for name in sorted(file) if isinstance(group := file[name], h5py.Group)}
 
 
 def _parsed(stored: Any) -> dict[str, str]:

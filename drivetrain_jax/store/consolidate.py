@@ -333,7 +333,7 @@ def read_attribute(path: Path, name: str) -> Any:
 def layout(path: Path) -> dict[str, tuple[np.dtype, tuple[int, ...]]]:
     """Types and shapes of all variables of the result at ``path``."""
     with opened(path) as file:
-        return {name: (each.dtype, each.shape) for name, each in file.items() if isinstance(each, h5py.Dataset)}
+        return {name: (data.dtype, data.shape) for name, data in file.items() if isinstance(data, h5py.Dataset)}
 
 
 def map_variable(path: Path, name: str) -> np.ndarray:
@@ -358,9 +358,9 @@ def read_plain(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     Raises :class:`InputError` if the file is not readable.
     """
     with opened(path) as file:
-        variables = {name: each for name, each in file.items() if isinstance(each, h5py.Dataset)}
-        strings = {name for name, each in variables.items() if h5py.check_string_dtype(each.dtype)}
-        arrays = {n: np.asarray((each.asstr() if n in strings else each)[()]) for n, each in variables.items()}
+        variables = {name: data for name, data in file.items() if isinstance(data, h5py.Dataset)}
+        strings = {name for name, data in variables.items() if h5py.check_string_dtype(data.dtype)}
+        arrays = {n: np.asarray((data.asstr() if n in strings else data)[()]) for n, data in variables.items()}
         return arrays, {name: _plain(value) for name, value in file.attrs.items()}
 
 

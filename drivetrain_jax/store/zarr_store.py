@@ -48,12 +48,12 @@ def create(path: Path, template: Labelled, shards: Shards, fills: Mapping[str, f
     replace(template, coords=coords, data={}).to_dataset().to_zarr(path, mode="w", zarr_format=3, consolidated=False)
     root = _root(path, "r+")
     for name, entry in template.data.items():
-        own = entry.values.shape[len(shards.shape) :]
+        inner = entry.values.shape[len(shards.shape) :]
         root.create_array(
             name,
             shape=entry.values.shape,
             dtype=entry.values.dtype,
-            chunks=(*shards.lengths, *(max(n, 1) for n in own)),
+            chunks=(*shards.lengths, *(max(n, 1) for n in inner)),
             fill_value=fills[name],
             compressors=zarr.codecs.Crc32cCodec(),
             dimension_names=entry.dims,
@@ -156,8 +156,8 @@ def seal(path: Path, attrs: Mapping[str, Any], labels: Mapping[str, Mapping[str,
     for file in path.rglob("*.partial"):
         file.unlink()
     root = _root(path, "r+")
-    for name, own in labels.items():
-        root[name].attrs.update({key: v.tolist() if hasattr(v, "tolist") else v for key, v in own.items()})
+    for name, label in labels.items():
+        root[name].attrs.update({key: v.tolist() if hasattr(v, "tolist") else v for key, v in label.items()})
     # Replace the attributes, because those of a growing store have no checksum; xarray needs the list of coordinates.
     kept = {name: value for name, value in root.attrs.items() if name == "coordinates"}
     root.attrs.put({**kept, **{name: value for name, value in attrs.items() if name not in DETAILS}})
@@ -204,11 +204,11 @@ def _digest(path: Path) -> str:
     content["attributes"].pop(SEAL, None)
     results = json.loads((path / _CHECKSUMS / "zarr.json").read_text())["attributes"][_RESULTS]
     shards, files = {path / name / "c" for name in (*results, _OF_SHARDS)}, {}
-    for folder, names, found in os.walk(path):
+    for folder, names, file_names in os.walk(path):
         names[:] = [name for name in names if Path(folder, name) not in shards]
-        files |= {file.relative_to(path).as_posix(): file for file in (Path(folder, name) for name in found)}
-    own = {name: file for name, file in files.items() if file not in {path / "zarr.json", *shards}}
-    return digest([content, source_digest(own)])
+        files |= {file.relative_to(path).as_posix(): file for file in (Path(folder, name) for name in file_names)}
+    unsharded = {name: file for name, file in files.items() if file not in {path / "zarr.json", *shards}}
+    return digest([content, source_digest(unsharded)])
 
 
 def _checksum(arrays: Mapping[str, np.ndarray]) -> int:

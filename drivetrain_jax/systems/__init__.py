@@ -81,9 +81,9 @@ def get_system(name: str) -> type[System]:
     """The system ``name``; ``KeyError`` with the known names if there is none, ``ImportError`` if its package fails."""
     if name in _BUILT_IN:
         return getattr(import_module(f"drivetrain_jax.systems.{name}"), _BUILT_IN[name])
-    found = load_plugin(SYSTEMS, name, "a system", lambda x: isinstance(x, type) and issubclass(x, System))
-    if found is None:
+    system = load_plugin(SYSTEMS, name, "a system", lambda x: isinstance(x, type) and issubclass(x, System))
+    if system is None:
         raise KeyError(
             f"system = {name!r}: allowed is one of {', '.join(system_names())}, or one that a package registers"
         )
-    return found
+    return system

@@ -102,54 +102,54 @@ class PhysicalData:
         missing, or if a parameter is given too.
         """
         defaults = {q.name: q.default for q in self.quantities if q.default is not None and q.name not in given}
-        found: dict[str, Any] = {}
-        for each in self.conversions:
-            known = {**defaults, **given, **found}
-            if each.needs[0] not in known or each.needs[0] in defaults:
+        results: dict[str, Any] = {}
+        for rule in self.conversions:
+            known = {**defaults, **given, **results}
+            if rule.needs[0] not in known or rule.needs[0] in defaults:
                 continue
-            missing = [name for name in each.needs if name not in known]
-            if each.parameter in given and (each.optional or each.replaceable):
+            missing = [name for name in rule.needs if name not in known]
+            if rule.parameter in given and (rule.optional or rule.replaceable):
                 continue
-            if each.parameter in given:
-                given_text = _shown(given[each.parameter])
+            if rule.parameter in given:
+                given_text = _shown(given[rule.parameter])
                 raise InputError(
-                    f"{each.parameter} = {given_text}: given besides {', '.join(each.needs)}; allowed is one of the two"
+                    f"{rule.parameter} = {given_text}: given besides {', '.join(rule.needs)}; allowed is one of the two"
                 )
-            if missing and not each.optional:
+            if missing and not rule.optional:
                 raise InputError(
-                    f"{missing[0]}: missing; {each.parameter} = {each.formula} needs {' and '.join(missing)}"
+                    f"{missing[0]}: missing; {rule.parameter} = {rule.formula} needs {' and '.join(missing)}"
                 )
             if not missing:
-                value, entries = _evaluated(each, [known[name] for name in each.needs]), known.get(each.per)
+                value, entries = _evaluated(rule, [known[name] for name in rule.needs]), known.get(rule.per)
                 if isinstance(entries, tuple) and not isinstance(value, tuple):
                     value = (value,) * len(entries)
-                found[each.parameter] = value
-        return found
+                results[rule.parameter] = value
+        return results
 
     def all_converted(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """As :meth:`converted`; raises :class:`InputError` for a quantity from which nothing follows."""
-        found = self.converted(given)
-        used = {name for each in self.conversions if each.parameter in found for name in each.needs}
+        results = self.converted(given)
+        used = {name for rule in self.conversions if rule.parameter in results for name in rule.needs}
         for name in self.names:
             if name in given and name not in used:
                 uses = [
-                    f"{each.parameter} needs {', '.join(each.needs)}" for each in self.conversions if name in each.needs
+                    f"{rule.parameter} needs {', '.join(rule.needs)}" for rule in self.conversions if name in rule.needs
                 ]
                 raise InputError(f"{name}: nothing follows from it ({'; '.join(uses)}); allowed is to leave it out")
-        return found
+        return results
 
     def back(self, parameter: str, known: Mapping[str, Any]) -> tuple[Parameter, Callable[[Any], Any]] | None:
         """The quantity behind ``parameter``, and its value as a function of the parameter; None if there is none, or if data
         are missing."""
         known = {q.name: q.default for q in self.quantities if q.default is not None} | dict(known)
-        for each in self.conversions:
-            if each.parameter == parameter and each.back and all(name in known for name in each.needs[1:]):
-                return self.quantity(each.needs[0]), partial(_back, each.back, [known[name] for name in each.needs[1:]])
+        for rule in self.conversions:
+            if rule.parameter == parameter and rule.back and all(name in known for name in rule.needs[1:]):
+                return self.quantity(rule.needs[0]), partial(_back, rule.back, [known[name] for name in rule.needs[1:]])
         return None
 
     def source(self, parameter: str) -> str:
         """The data that ``parameter`` follows from as text, empty without any."""
-        return next((", ".join(each.needs) for each in self.conversions if each.parameter == parameter), "")
+        return next((", ".join(rule.needs) for rule in self.conversions if rule.parameter == parameter), "")
 
 
 def _back(back: Callable[..., Any], others: list[Any], value: Any) -> Any:
@@ -168,13 +168,13 @@ def _evaluated(conversion: Conversion, needs: list[Any]) -> Any:
         isinstance(value, tuple) and name not in conversion.whole
         for name, value in zip(conversion.needs, needs, strict=True)
     ]
-    lengths = {name: len(v) for name, v, each in zip(conversion.needs, needs, listed, strict=True) if each}
+    lengths = {name: len(v) for name, v, is_listed in zip(conversion.needs, needs, listed, strict=True) if is_listed}
     if len(set(lengths.values())) > 1:
         counts = ", ".join(f"{name} has {count}" for name, count in lengths.items())
         raise InputError(f"{conversion.needs[0]}: {counts} entries; allowed are lists of one length")
     if lengths:
         count = next(iter(lengths.values()))
-        entries = [[v[i] if each else v for v, each in zip(needs, listed, strict=True)] for i in range(count)]
+        entries = [[v[i] if is_listed else v for v, is_listed in zip(needs, listed, strict=True)] for i in range(count)]
         return tuple(_evaluated(conversion, entry) for entry in entries)
     axes = list(dict.fromkeys(value.axis for value in needs if isinstance(value, Along)))
     if len(axes) > 1:
@@ -182,7 +182,7 @@ def _evaluated(conversion: Conversion, needs: list[Any]) -> Any:
             f"axes.{axes[1]}: changes {conversion.parameter} together with {axes[0]}; allowed is one of them as an axis, "
             "or both in [points]"
         )
-    value = conversion.value(*(each.values if isinstance(each, Along) else each for each in needs))
+    value = conversion.value(*(need.values if isinstance(need, Along) else need for need in needs))
     if axes:
         return Along(axes[0], np.asarray(value, float))
     return value if isinstance(value, (str, jax.core.Tracer)) or np.ndim(value) else float(value)
@@ -310,16 +310,16 @@ class System(eqx.Module):
 
     def __init_subclass__(cls, **more: Any) -> None:
         super().__init_subclass__(**more)
-        own = vars(cls)
+        body = vars(cls)
         fields = {
-            name: own[name].metadata for name in own.get("__annotations__", {}) if hasattr(own.get(name), "metadata")
+            name: body[name].metadata for name in body.get("__annotations__", {}) if hasattr(body.get(name), "metadata")
         }
-        for name, kind in own.get("__annotations__", {}).items():
+        for name, kind in body.get("__annotations__", {}).items():
             if name not in fields and "ClassVar" not in str(kind):
                 raise TypeError(f"{cls.__name__}.{name}: not a parameter; allowed is {name}: Any = parameter(...)")
         cls.parameters += tuple(replace(m[_PARAMETER], name=name) for name, m in fields.items() if _PARAMETER in m)
-        if "models" not in own:
-            cls.models = dict(cls.models) | {a: m for method in own.values() for a, m in _models(cls, method).items()}
+        if "models" not in body:
+            cls.models = dict(cls.models) | {a: m for method in body.values() for a, m in _models(cls, method).items()}
         _check_names(cls)
         if "atlas" in cls.models and "floquet" not in cls.models:
             raise ValueError(f"models of {cls.name}: atlas needs floquet as well")
@@ -334,7 +334,7 @@ class System(eqx.Module):
                 f"{cls.__name__}: {len(values)} values without names; allowed is {cls.__name__}(name=value, ...)"
             )
         physical = cls.physical.names if cls.physical else ()
-        known = [each.name for each in dataclass_fields(cls)]
+        known = [field.name for field in dataclass_fields(cls)]
         for name in given:
             if name in physical:
                 raise InputError(f"{name}: physical data; allowed in {cls.__name__}.from_physical(...)")
@@ -343,8 +343,8 @@ class System(eqx.Module):
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
-        for each in self.parameters:
-            object.__setattr__(self, each.name, _admitted(each, getattr(self, each.name)))
+        for kind in self.parameters:
+            object.__setattr__(self, kind.name, _admitted(kind, getattr(self, kind.name)))
 
     def __repr__(self) -> str:
         return printed(self)
@@ -353,14 +353,14 @@ class System(eqx.Module):
     def of(cls, values: Values) -> Any:
         """The system with these ``values``, which are not checked; a parameter that is missing has its default."""
         new = object.__new__(cls)
-        for each in cls.parameters:
-            object.__setattr__(new, each.name, values.get(each.name, each.default))
+        for kind in cls.parameters:
+            object.__setattr__(new, kind.name, values.get(kind.name, kind.default))
         return new
 
     @property
     def values(self) -> dict[str, Any]:
         """The parameters by name, those left out that are to be derived from others."""
-        named = {each.name: getattr(self, each.name) for each in self.parameters}
+        named = {kind.name: getattr(self, kind.name) for kind in self.parameters}
         return {name: value for name, value in named.items() if value is not None}
 
     @classmethod
@@ -373,14 +373,14 @@ class System(eqx.Module):
         """
         if cls.physical is None:
             raise InputError(f"system = {cls.name!r}: has no physical data; allowed is {cls.__name__}(...)")
-        known = {each.name: each for each in (*cls.physical.quantities, *cls.parameters)}
+        known = {kind.name: kind for kind in (*cls.physical.quantities, *cls.parameters)}
         for name in data:
             if name not in known:
                 guess = meant(name, known.values())
                 raise InputError(f"{name}: unknown{guess}; allowed is {', '.join(known)}")
         given = {name: _admitted(known[name], value) for name, value in data.items()}
-        found = given | cls.physical.all_converted(given)
-        return cls(**{name: value for name, value in found.items() if name not in cls.physical.names})
+        values = given | cls.physical.all_converted(given)
+        return cls(**{name: value for name, value in values.items() if name not in cls.physical.names})
 
     @classmethod
     def unit_of_time(cls) -> str:
@@ -402,18 +402,18 @@ class System(eqx.Module):
 
 def _check_names(system: type[System]) -> None:
     """Raise :class:`~drivetrain_jax.InputError` for units that are none, and for names that are no parameters."""
-    names = [each.name for each in system.parameters]
-    for each in (*system.parameters, *(system.physical.quantities if system.physical else ())):
-        if not is_unit(each.units):
+    names = [quantity.name for quantity in system.parameters]
+    for quantity in (*system.parameters, *(system.physical.quantities if system.physical else ())):
+        if not is_unit(quantity.units):
             raise InputError(
-                f"{system.__name__}.{each.name}: units = {each.units!r}; allowed is 1 or units such as N m/rad"
+                f"{system.__name__}.{quantity.name}: units = {quantity.units!r}; allowed is 1 or units such as N m/rad"
             )
     named = {f"roles[{role!r}]": [name] for role, name in system.roles.items()}
     for analysis, model in system.models.items():
         named[f"parameters of {analysis}"] = list(model.parameters)
         named[f"smooth of {analysis}"] = list(model.smooth.coordinates) if model.smooth else []
-    for where, given in named.items():
-        for name in given:
+    for where, listed in named.items():
+        for name in listed:
             if name not in names:
                 raise InputError(f"{system.__name__}: {where}: {name!r} is not a parameter{nearest(name, names)}")
 
@@ -453,8 +453,8 @@ def _admitted(described: Parameter, value: Any) -> Any:
     if described.listed and isinstance(value, (np.ndarray, jax.Array)) and value.ndim == 1:
         value = value if isinstance(value, jax.core.Tracer) else value.tolist()
     if described.listed and isinstance(value, (list, tuple)):
-        each = replace(described, listed=False)
-        return tuple(_number(replace(each, name=f"{each.name}[{i}]"), entry) for i, entry in enumerate(value))
+        one = replace(described, listed=False)
+        return tuple(_number(replace(one, name=f"{one.name}[{i}]"), entry) for i, entry in enumerate(value))
     return _number(described, value)
 
 

@@ -296,12 +296,12 @@ class FloquetModel(eqx.Module):
             return self.hamiltonian()
         if self.natural.size % 2:
             return False
-        half, found = self.natural.size // 2, jnp.bool_(True)
+        half, symmetric = self.natural.size // 2, jnp.bool_(True)
         for part in self.natural.parts:
             matrices = jax.vmap(part.matrix)(_INSTANTS * part.span)
             rotated = jnp.concatenate([matrices[:, half:], -matrices[:, :half]], axis=1)
-            found &= jnp.all(rotated == jnp.swapaxes(rotated, 1, 2), axis=(0, 1, 2))
-        return found
+            symmetric &= jnp.all(rotated == jnp.swapaxes(rotated, 1, 2), axis=(0, 1, 2))
+        return symmetric
 
 
 class ForcedModel(eqx.Module):

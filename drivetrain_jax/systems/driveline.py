@@ -73,8 +73,8 @@ def _is_number(x: Any) -> bool:
 
 def _fraction(x: float) -> Fraction | None:
     """The fraction of small integers whose rounding is ``x``, None if there is none."""
-    found = Fraction(x).limit_denominator(_DENOMINATORS)
-    return found if abs(float(found) - x) <= 2 * _EPS * abs(x) else None
+    fraction = Fraction(x).limit_denominator(_DENOMINATORS)
+    return fraction if abs(float(fraction) - x) <= 2 * _EPS * abs(x) else None
 
 
 def _half_turns(speeds: Sequence[float]) -> Fraction | None:
@@ -87,8 +87,8 @@ def _half_turns(speeds: Sequence[float]) -> Fraction | None:
         return None
     known = [x for x in fractions if x is not None]
     common = math.lcm(*(x.denominator for x in known))
-    found = Fraction(common, math.gcd(*(abs(x.numerator) for x in known)))
-    return found if common <= _DENOMINATORS and found <= 2 * MOST_TURNS else None
+    turns = Fraction(common, math.gcd(*(abs(x.numerator) for x in known)))
+    return turns if common <= _DENOMINATORS and turns <= 2 * MOST_TURNS else None
 
 
 def _traced_half_turns(speeds: Sequence[Any], bent: Sequence[Any]) -> Array:
@@ -103,8 +103,8 @@ def _traced_half_turns(speeds: Sequence[Any], bent: Sequence[Any]) -> Array:
     for speed, counts in zip(speeds, bent, strict=True):
         whole = jnp.round(first * jnp.abs(speed)).astype(int)
         divisor = jnp.where(counts, jnp.gcd(divisor, whole), divisor)
-    found = first / jnp.maximum(divisor, 1)
-    return jnp.where(jnp.any(common, axis=0) & (found <= 2 * MOST_TURNS), found, jnp.nan)
+    turns = first / jnp.maximum(divisor, 1)
+    return jnp.where(jnp.any(common, axis=0) & (turns <= 2 * MOST_TURNS), turns, jnp.nan)
 
 
 @jax.custom_jvp
@@ -151,12 +151,12 @@ def rigid_motion(
     ``cosine`` and ``sine`` are those of 2 tau. Without gears each joint maps e^(2i Psi) by a rational function, eq. (4);
     the angle itself is needed at a gear alone.
     """
-    found, angle, rate, acceleration = [], tau, 1.0, 0.0
+    joints, angle, rate, acceleration = [], tau, 1.0, 0.0
     last = max((i for i, b in enumerate(beta) if not _is_straight(b)), default=-1)
     gears = [i for i in range(last) if not (_is_number(ratio[i]) and ratio[i] == 1)]
     for i, (b, p, r) in enumerate(zip(beta, phase, ratio, strict=True)):
         if _is_straight(b):
-            found.append(Joint(r, 0.0, 0.0, rate))
+            joints.append(Joint(r, 0.0, 0.0, rate))
         else:
             c, square = jnp.cos(b), jnp.sin(b) ** 2
             cosine, sine = _rotated(cosine, sine, p)
@@ -168,19 +168,19 @@ def rigid_motion(
             if order > 1:
                 second = 2 * c * square * (cosine / d**2 + square * sine**2 / d**3)
                 curve = r * (second * rate**2 + by_angle * acceleration)
-            found.append(Joint(r * eta, slope, curve, rate))
+            joints.append(Joint(r * eta, slope, curve, rate))
             if i < last:
                 if gears and i <= gears[-1]:
                     rho = jnp.tan(b / 2) ** 2
                     angle = angle - jnp.arctan2(rho * sine, 1 + rho * cosine)
                 turned = ((1 + cosine) - c**2 * (1 - cosine)) / (2 * d), c * sine / d
                 cosine, sine = _rotated(*turned, -p)
-        joint = found[-1]
+        joint = joints[-1]
         rate, acceleration = joint.h * rate, joint.h * acceleration + joint.slope * rate
         if i in gears:
             angle = r * angle
             cosine, sine = jnp.cos(2 * angle), jnp.sin(2 * angle)
-    return found
+    return joints
 
 
 def behind(beta: Any, phase: Any, angle: Any) -> Any:
@@ -254,7 +254,7 @@ def best_phases(beta: Components, phase: Components, ratio: Components) -> list[
     A joint moves a point of the hyperbolic plane by l = ln sec(beta) in the direction of its phase, eq. (8). The path closes
     if no l is longer than all others together; each joint turns back as far as the remaining ones can make up for.
     """
-    found, b, lengths = [], jnp.zeros((), complex), [-jnp.log(jnp.cos(x)) for x in beta]
+    phases, b, lengths = [], jnp.zeros((), complex), [-jnp.log(jnp.cos(x)) for x in beta]
     for i, (p, length) in enumerate(zip(phase, lengths, strict=True)):
         # Joints behind the next gear make up for nothing.
         together, total, longest = True, 0.0, 0.0
@@ -270,9 +270,9 @@ def best_phases(beta: Components, phase: Components, ratio: Components) -> list[
         # Straight back without the rounding of the cosine.
         cosine = jnp.where(goal <= back, -1.0, jnp.clip(cosine, -1.0, 1.0))
         turned = (jnp.arccos(cosine) - jnp.angle(jnp.where(free, 1.0, b))) / 2
-        found.append(jnp.mod(jnp.where(free | (length == 0), p, turned), math.pi))
-        b = jnp.where(ratio[i] == 1, _moved(b, jnp.tan(beta[i] / 2) ** 2, found[-1]), 0.0)
-    return found
+        phases.append(jnp.mod(jnp.where(free | (length == 0), p, turned), math.pi))
+        b = jnp.where(ratio[i] == 1, _moved(b, jnp.tan(beta[i] / 2) ** 2, phases[-1]), 0.0)
+    return phases
 
 
 def uneven_rotation(beta: Components, phase: Components, ratio: Components, half_turns: Any) -> tuple[Any, Any]:
@@ -403,11 +403,11 @@ class Driveline(System):
 
     def _joints(self, tau: Any, cosine: Any, sine: Any, order: int = 1) -> list[Joint]:
         beta, phase, ratio = self.chain
-        own, later = [], False
+        ratios, later = [], False
         for b, r in zip(reversed(beta), reversed(ratio), strict=True):
-            own.append(r if _is_number(r) else _without_derivative(r, later))
+            ratios.append(r if _is_number(r) else _without_derivative(r, later))
             later |= b != 0
-        return rigid_motion(beta, phase, own[::-1], tau, cosine, sine, order)
+        return rigid_motion(beta, phase, ratios[::-1], tau, cosine, sine, order)
 
     def half_turns(self) -> Any:
         """The period T of the joints over pi; NaN if they have none of up to `MOST_TURNS` turns, 1 without joints.
@@ -423,9 +423,9 @@ class Driveline(System):
             # Joints that may be straight in a part of the batch count only if they do not matter.
             certain = [speed for speed, b in joints if _is_number(b)]
             sets = [certain, *([*certain, speed] for speed, b in joints if not _is_number(b)), [x for x, _ in joints]]
-            found = {_half_turns(each) if each else Fraction(1) for each in sets}
-            if len(found) == 1:
-                known = found.pop()
+            periods = {_half_turns(speeds_of_set) if speeds_of_set else Fraction(1) for speeds_of_set in sets}
+            if len(periods) == 1:
+                known = periods.pop()
                 return math.nan if known is None else float(known)
         return _traced_half_turns([x for x, _ in joints], [b != 0 for _, b in joints])
 
@@ -439,8 +439,8 @@ class Driveline(System):
         torques = [*self.torques(theta, rates), 0.0]
         onward = [*ratios[1:], 0.0]
         absolute = [
-            (h * after - own) / inertia
-            for h, after, own, inertia in zip(onward, torques[1:], torques, self.J, strict=False)
+            (h * after - torque) / inertia
+            for h, after, torque, inertia in zip(onward, torques[1:], torques, self.J, strict=False)
         ]
         before = [0.0, *absolute[:-1]]
         relative = [a - h * b - x for a, h, b, x in zip(absolute, ratios, before, excess, strict=True)]
@@ -561,8 +561,8 @@ class Driveline(System):
             turn = jnp.exp(2j * phase)
             s = -rho * turn * b
             mean = (1 + rho**2) / (1 - rho**2) * ((1 + s) / (1 - s)).real + 2 * (s / (1 - s) ** 2).real
-            own = 1 / self.J[i] + (ratio**2 * mean / self.J[i - 1] if i else 0.0)
-            total = total + self.c[i] * own
+            share = 1 / self.J[i] + (ratio**2 * mean / self.J[i - 1] if i else 0.0)
+            total = total + self.c[i] * share
             a = rho * jnp.conj(turn)
             b = (b + a) / (1 + jnp.conj(a) * b)
         return jnp.asarray(-math.pi / self.speed * total)

@@ -116,7 +116,7 @@ def _extensions(p: Mapping[str, Array], directions: Array) -> tuple[Array, Array
     # Rows: two bearings of a planet, which have no pressure angle, and its meshes.
     angle, meshes = jnp.stack([p["pressure_angle_r"], p["pressure_angle_s"]]), np.array([0, 0, 0, 1])
     weights = (jnp.ones((4, *lanes)), jnp.cos(angle)[meshes], jnp.sin(angle)[meshes])
-    central, own = (
+    central, of_planet = (
         sum(
             w.reshape(4, *(1,) * (part.ndim - 1), *lanes) * part[(...,) + (None,) * len(lanes)]
             for w, part in zip(weights, parts, strict=True)
@@ -125,10 +125,10 @@ def _extensions(p: Mapping[str, Array], directions: Array) -> tuple[Array, Array
     )
     coupling = sum(directions[None, :, None, i] * central[:, None, :, i] for i in range(3))  # pyright: ignore[reportIndexIssue]
     eye = np.eye(n).reshape(1, n, n, 1, *(1,) * len(lanes))
-    planets = (eye * own[:, None, None]).reshape(4 * n, _PER_PLANET * n, *lanes)  # pyright: ignore[reportIndexIssue]
+    planets = (eye * of_planet[:, None, None]).reshape(4 * n, _PER_PLANET * n, *lanes)  # pyright: ignore[reportIndexIssue]
     springs = jnp.concatenate([coupling.reshape(4 * n, _CENTRAL, *lanes), planets], axis=1)  # pyright: ignore[reportAttributeAccessIssue]
     bearings = np.eye(_CENTRAL, _CENTRAL + _PER_PLANET * n).reshape(_CENTRAL, -1, *(1,) * len(lanes))
-    return jnp.concatenate([springs, jnp.broadcast_to(bearings, (_CENTRAL, *springs.shape[1:]))]), own  # pyright: ignore[reportReturnType]
+    return jnp.concatenate([springs, jnp.broadcast_to(bearings, (_CENTRAL, *springs.shape[1:]))]), of_planet  # pyright: ignore[reportReturnType]
 
 
 def _stiffness_and_mass(p: Mapping[str, Array], n: int) -> tuple[Array, Array]:
@@ -171,8 +171,8 @@ def _embed(frame: Array, inertia_frame: Array | None = None) -> Array:
     n, k, lanes = frame.shape[0], frame.shape[1], frame.shape[2:]
     other = frame if inertia_frame is None else inertia_frame
     planets = jnp.zeros((n, _PER_PLANET, k, _PER_PLANET, *lanes))
-    for own, part in ((0, frame), (1, frame), (2, other)):
-        planets = planets.at[:, own, :, own].set(part)
+    for row, part in ((0, frame), (1, frame), (2, other)):
+        planets = planets.at[:, row, :, row].set(part)
     whole = jnp.zeros((_CENTRAL + _PER_PLANET * n, _CENTRAL + _PER_PLANET * k, *lanes))
     eye = np.eye(_CENTRAL).reshape(_CENTRAL, _CENTRAL, *(1,) * len(lanes))
     whole = whole.at[:_CENTRAL, :_CENTRAL].set(jnp.broadcast_to(eye, (_CENTRAL, _CENTRAL, *lanes)))
@@ -205,7 +205,7 @@ def _reduced_blocks(p: Mapping[str, Array], frame: Array, directions: Array, bal
     these three vectors in the frame.
     """
     n = frame.shape[0]
-    extensions, own = _extensions(p, directions)
+    extensions, of_planet = _extensions(p, directions)
     stiffness, mass = _stiffness_and_mass(p, 3)
     factor, basis = weighted_factor(extensions, stiffness, mass), _embed(frame[:, :3])
     family, polar = _families(3)
@@ -219,7 +219,7 @@ def _reduced_blocks(p: Mapping[str, Array], frame: Array, directions: Array, bal
         springs, masses = stiffness[:12:3], mass[_CENTRAL : _CENTRAL + _PER_PLANET]
         alone = jnp.stack([_embed(frame[:, i : i + 1])[:, _CENTRAL:] for i in range(3, n)], axis=2)
         kind = np.full(_PER_PLANET, PLANET)
-        blocks.append(Block(weighted_factor(own, springs, masses), kind, kind < 0, alone))
+        blocks.append(Block(weighted_factor(of_planet, springs, masses), kind, kind < 0, alone))
     return tuple(blocks)
 
 
@@ -329,26 +329,26 @@ def rotational_springs(values: Values) -> SpringSystem:
 def driven_springs(values: Values, springs: SpringSystem) -> DrivenSprings:
     """The gear ``springs`` with transmission errors of its meshes and torques on its bodies, eq (15)."""
     n, names = len(values["planet_angle"]), springs.dofs
-    given = [stack(entries_of(values[name], n)) for name in ERRORS] + [
+    excitations = [stack(entries_of(values[name], n)) for name in ERRORS] + [
         jnp.asarray(values[f"T_{body}"]) for body in "crs"
     ]
-    lanes = _lanes(springs.mass[0], *(x[0] for x in given[: len(ERRORS)]), *given[len(ERRORS) :])
+    lanes = _lanes(springs.mass[0], *(x[0] for x in excitations[: len(ERRORS)]), *excitations[len(ERRORS) :])
 
-    def spread(array: Array, own: int) -> Array:
-        """``array`` in the shape of the lanes, with its ``own`` axes first."""
-        missing = (1,) * (len(lanes) - array.ndim + own)
+    def spread(array: Array, axes: int) -> Array:
+        """``array`` in the shape of the lanes, with its ``axes`` axes first."""
+        missing = (1,) * (len(lanes) - array.ndim + axes)
         return jnp.broadcast_to(
-            array.reshape(array.shape[:own] + missing + array.shape[own:]), array.shape[:own] + lanes
+            array.reshape(array.shape[:axes] + missing + array.shape[axes:]), array.shape[:axes] + lanes
         )
 
-    sun, ring, sun_phase, ring_phase = (spread(x, 1) for x in given[: len(ERRORS)])
+    sun, ring, sun_phase, ring_phase = (spread(x, 1) for x in excitations[: len(ERRORS)])
     errors = jnp.concatenate([ring * jnp.exp(1j * ring_phase), sun * jnp.exp(1j * sun_phase)])
     # Order of the springs: meshes with the ring, meshes with the sun, bearings of the bodies.
     end = springs.stiffness.shape[0] - (_CENTRAL if len(names) > 3 + n else 3)
     meshes = slice(end - 2 * n, end)
     forces = spread(springs.stiffness[meshes], 1) * errors
     force = jnp.sum(spread(springs.extensions[meshes], 2) * forces[:, None], axis=0)
-    for body, torque in zip("crs", given[len(ERRORS) :], strict=True):
+    for body, torque in zip("crs", excitations[len(ERRORS) :], strict=True):
         force = force.at[names.index(f"u_{body}")].add(spread(torque, 0))
     return DrivenSprings(springs, force)
 

@@ -70,13 +70,13 @@ def direct_solvers(
             model, lanes = build(values), lane_count(values)
             ratio = jnp.where(target <= _FINE, _RATIO, 2) if model.panels is not None else 2
 
-            def one(own: Mapping[str, Any], panels: Array) -> Monodromy:
-                return monodromy(form(build(own)), panels, target, ratio, lanes)
+            def one(point: Mapping[str, Any], panels: Array) -> Monodromy:
+                return monodromy(form(build(point)), panels, target, ratio, lanes)
 
             def factors() -> Factored:
                 # Gauss schemes need panels in proportion to fast decays and growths.
                 count = jnp.maximum(panels, jnp.minimum(fastest_rate(form(model)), _MOST_FACTORS).astype(int))
-                return over_lanes(lambda own, count: factored(form(build(own)), count, lanes))(values, count)
+                return over_lanes(lambda point, count: factored(form(build(point)), count, lanes))(values, count)
 
             return results(model, over_lanes(one)(values, panels), factors)
 
@@ -149,7 +149,7 @@ def _derivatives(
     slopes = pull(jnp.concatenate([by_entry.real, by_entry.imag]))
     moved = slopes[:n] + 1j * slopes[n:]
     outward = (jnp.conj(unit)[:, None] * moved).real
-    found = {"spectral_radius": jnp.where(known, scale * outward[0], jnp.nan), "floquet_multiplier": scale * moved}
+    jacobians = {"spectral_radius": jnp.where(known, scale * outward[0], jnp.nan), "floquet_multiplier": scale * moved}
     if "floquet_exponent" in request.outputs:
 
         def period(parameters: Any) -> Array:
@@ -158,10 +158,10 @@ def _derivatives(
         span, longer = jax.value_and_grad(period)(parameters)
         modulus = jnp.abs(sigma)
         rates = (jnp.log(modulus) + log_scale) / span
-        found["floquet_exponent"] = (
+        jacobians["floquet_exponent"] = (
             outward / modulus[:, None] - rates[:, None] * jnp.stack(jax.tree.leaves(longer))
         ) / span
-    return found
+    return jacobians
 
 
 def _lacks(system: type[System]) -> dict[str, str]:

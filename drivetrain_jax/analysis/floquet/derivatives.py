@@ -74,10 +74,10 @@ def weighted_gradient(
     return lanes_last(_pulled, fixed, (parameters, before, weights), count, _LANES)
 
 
-def _pulled(fixed: Constants, given: tuple[Any, Array, Array], count: Array) -> Any:
+def _pulled(fixed: Constants, arrays: tuple[Any, Array, Array], count: Array) -> Any:
     """The :func:`weighted_gradient` of all lanes, which are the last axis of each array."""
-    parameters, before, weights = given
-    lanes = max(x.shape[-1] for x in jax.tree.leaves(given) if x.ndim)
+    parameters, before, weights = arrays
+    lanes = max(x.shape[-1] for x in jax.tree.leaves(arrays) if x.ndim)
     parameters = jax.tree.map(lambda x: jnp.broadcast_to(x, lanes), parameters)
     before, weights = (jnp.broadcast_to(x, (*x.shape[:-1], lanes)) for x in (before, weights))
     build, constants, number = fixed.tree
@@ -105,8 +105,8 @@ def _pulled(fixed: Constants, given: tuple[Any, Array, Array], count: Array) -> 
         def back(j: Array, carry: tuple[Any, Array]) -> tuple[Any, Array]:
             i = short - 1 - j
             matrix, pull = jax.vjp(partial(panel, k * short + i), parameters)
-            own = jnp.sum(carry[1][:, :, None] * kept[1, i][None, None], axis=3)
-            (more,) = jax.vmap(pull)(own)
+            weight = jnp.sum(carry[1][:, :, None] * kept[1, i][None, None], axis=3)
+            (more,) = jax.vmap(pull)(weight)
             earlier = jax.vmap(matmul, (None, 0))(jnp.swapaxes(matrix, 0, 1), carry[1])
             return jax.tree.map(jnp.add, carry[0], more), earlier
 
@@ -158,7 +158,7 @@ def monodromy(build: Build, parameters: Any, constants: Constants, panels: Array
     # Half as many panels show the error, because nothing else checks their predicted number.
     counts = jnp.stack([(panels + 1) // 2, panels])
     coarse, parts = jax.lax.map(partial(propagators, build, parameters, constants), counts)
-    before, phi = (reduce(lambda earlier, later: later @ earlier, each) for each in (coarse, parts))
+    before, phi = (reduce(lambda earlier, later: later @ earlier, factors) for factors in (coarse, parts))
     change = jnp.linalg.norm(phi - before) / jnp.linalg.norm(phi)
     # Scaled to 1, so that its square, Z, does not overflow.
     size = jnp.max(jnp.abs(phi))
@@ -176,8 +176,8 @@ def monodromy(build: Build, parameters: Any, constants: Constants, panels: Array
             before = jnp.eye(len(phi))
             for earlier in parts[:number]:
                 before = earlier @ before
-            own = weighted_gradient(build, parameters, constants, number, before, weights, panels)
-            gradient = jax.tree.map(jnp.add, gradient, own)
+            gradient_of_part = weighted_gradient(build, parameters, constants, number, before, weights, panels)
+            gradient = jax.tree.map(jnp.add, gradient, gradient_of_part)
             weights = parts[number].T @ weights
         return jnp.stack(jax.tree.leaves(gradient), axis=1)
 

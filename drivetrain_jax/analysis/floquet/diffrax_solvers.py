@@ -58,7 +58,7 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
         order = solver.order(model.reduced)
 
         def propagate(steps: Array) -> Array:
-            return over_lanes(lambda own, steps: _in_equal_steps(build(own).reduced, solver, steps))(values, steps)
+            return over_lanes(lambda point, steps: _in_equal_steps(build(point).reduced, solver, steps))(values, steps)
 
         records = over_lanes(partial(_records, build))(values, jnp.max(traced_panels(build, values, _OF_RECORDS)))
         steps = jnp.maximum(steps, jnp.ceil(stable_steps(model.reduced)).astype(steps.dtype))
@@ -68,13 +68,13 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
     def effort(columns: Mapping[str, Any]) -> np.ndarray:
         # Fitted for order 8; a lower order needs more steps for a smaller tolerance.
         more = rtol ** (1 / 8 - 1 / solver.order(diffrax.ODETerm(lambda t, y, args: y)))
-        found = more * steps_needed(system, columns, rtol)
-        return np.where(found <= MAX_STEPS, found, np.inf)
+        steps = more * steps_needed(system, columns, rtol)
+        return np.where(steps <= MAX_STEPS, steps, np.inf)
 
     def steps(values: Mapping[str, Any]) -> Array:
         order = solver.order(diffrax.ODETerm(lambda t, y, args: y))
-        found = rtol ** (1 / 8 - 1 / order) * traced_steps(build, values, rtol)
-        return jnp.minimum(found, MAX_STEPS).astype(jnp.int64)
+        count = rtol ** (1 / 8 - 1 / order) * traced_steps(build, values, rtol)
+        return jnp.minimum(count, MAX_STEPS).astype(jnp.int64)
 
     return (
         Solver(
@@ -116,18 +116,18 @@ def _refined(
     )
 
     def unfinished(state: tuple) -> Array:
-        count, current, _, found = state
-        finite = jnp.all(jnp.isfinite(found.matrix), axis=(0, 1))
-        lagging = jnp.where(finite, count < 2 + _MAX_REFINEMENTS, count < 4) & ~found.met
+        count, current, _, z = state
+        finite = jnp.all(jnp.isfinite(z.matrix), axis=(0, 1))
+        lagging = jnp.where(finite, count < 2 + _MAX_REFINEMENTS, count < 4) & ~z.met
         return (count < 2) | ((current <= MAX_STEPS) & jnp.any(lagging))
 
     def refine(state: tuple) -> tuple:
         count, current, coarse, _ = state
         fine = records._replace(matrix=propagate(current))
-        found = jax.lax.cond(
+        z = jax.lax.cond(
             count > 0, lambda: compare(ends, determinant, coarse, fine, current, 2.0**order, target), lambda: nothing
         )
-        return count + 1, 2 * current, fine, found
+        return count + 1, 2 * current, fine, z
 
     start = (jnp.int32(0), jnp.maximum(-(-steps // 2), 1), blank, nothing)
     return jax.lax.while_loop(unfinished, refine, start)[-1]
@@ -155,16 +155,16 @@ def adaptive_steps(system: type[System], request: Request) -> tuple[Solver, ...]
         records = _records(build, values, panels, as_published) if needs_error else Propagator(fine, jnp.zeros(()))
         coarse, fine = (records._replace(matrix=matrix) for matrix in (coarse, fine))
         z = compare(form.ends(), determinant, coarse, fine, jnp.zeros(()), 1 + _REDUCTION, rtol)
-        found = results(z, request.outputs, rtol, model)
+        values_of_z = results(z, request.outputs, rtol, model)
         failed = ~(success & success_coarse)
         lost = jnp.where(has_finite_entries(form), jnp.int8(Outcome.STEP_LIMIT), jnp.int8(Outcome.NOT_FINITE))
-        return found | {"outcome": jnp.where(failed, lost, found["outcome"])}
+        return values_of_z | {"outcome": jnp.where(failed, lost, values_of_z["outcome"])}
 
     def effort(columns: Mapping[str, Any]) -> np.ndarray:
         # Infinite where equal steps of order 8 would be five times ``MAX_STEPS``: no explicit solver gets there. An implicit
         # one may.
-        found = steps_needed(system, columns, rtol)
-        return np.nan_to_num(found) if issubclass(type(solver), diffrax.AbstractImplicitSolver) else found
+        steps = steps_needed(system, columns, rtol)
+        return np.nan_to_num(steps) if issubclass(type(solver), diffrax.AbstractImplicitSolver) else steps
 
     name = f"diffrax: {request.options['solver']}, {request.options['form']}, adaptive steps"
     return (Solver(name, over_lanes(solve), effort, seconds=1e-6, chunk=256),)

@@ -52,7 +52,7 @@ def traced_panels(build: Build, values: Mapping[str, Any], rtol: float) -> Array
         panels = model.panels(rtol)
     else:
         arrays, rest = eqx.partition(dict(values), lambda x: isinstance(x, jax.Array) and x.ndim > 0)
-        need = lambda own: _panels_of(*_estimate(build, eqx.combine(own, rest)), rtol)  # noqa: E731
+        need = lambda point: _panels_of(*_estimate(build, eqx.combine(point, rest)), rtol)  # noqa: E731
         panels = jax.vmap(need)(arrays) if jax.tree.leaves(arrays) else need(arrays)
     panels = jnp.ceil(jnp.where(jnp.isnan(panels), _TO_FIND_NO_VALUE, panels))
     return jnp.clip(panels, 2, MAX_PANELS).astype(jnp.int64)

@@ -103,9 +103,9 @@ def spectral_radius_bound(real: Array, imaginary: Array, error: Array) -> Array:
     """
     n, rho = len(real), over_first(jnp.maximum, jnp.hypot(real, imaginary))
     x, y = real / rho, imaginary / rho
-    modulus, own = jnp.hypot(x, y), _diagonal(n, rho.ndim)
+    modulus, diagonal = jnp.hypot(x, y), _diagonal(n, rho.ndim)
     gap = jnp.hypot(x[:, None] - x, y[:, None] - y)
-    closest = over_first(jnp.minimum, jnp.where(own, jnp.inf, gap))
+    closest = over_first(jnp.minimum, jnp.where(diagonal, jnp.inf, gap))
     x1, y1, top = x[0], y[0], modulus[0]
     for j in range(1, n):
         larger = modulus[j] > top
@@ -115,7 +115,7 @@ def spectral_radius_bound(real: Array, imaginary: Array, error: Array) -> Array:
         """For ``|z| <= 1 + r``, and for the circle about the largest multiplier; the unit is rho."""
         reach = 1 + r - modulus
         margin = jnp.where((reach < closest / 32)[:, None], gap - reach[:, None], gap / 2)
-        factors = jnp.where(own, reach, jnp.maximum(reach, margin))
+        factors = jnp.where(diagonal, reach, jnp.maximum(reach, margin))
         least = over_first(jnp.minimum, over_first(jnp.multiply, jnp.swapaxes(factors, 0, 1)))
         return jnp.stack([least, over_first(jnp.multiply, jnp.abs(jnp.hypot(x - x1, y - y1) - r))]) > eps
 
@@ -153,13 +153,13 @@ def multiplier_errors(real: Array, imaginary: Array, error: Array, counted: Arra
     return rho * (_smallest_radii(certified, real, len(real), error) + 4 * np.finfo(float).eps)
 
 
-def graded_multipliers(found: Factored) -> tuple[Array, Array, Array]:
+def graded_multipliers(factored: Factored) -> tuple[Array, Array, Array]:
     """Multipliers in falling order of size, as ``exp(logs) sigma``, with bounds of the errors of sigma, ``(n, ...)`` each.
 
     Multipliers whose sizes are within a factor of ``1/_APART`` are those of one diagonal block. Its characteristic
     polynomial is wrong by the difference between both numbers of panels, by rounding, and by what couples it to others.
     """
-    logs, turn = found.logs[1], found.turn[1]
+    logs, turn = factored.logs[1], factored.turn[1]
     n, axes = len(logs), (1,) * (logs.ndim - 1)
     place = np.arange(n).reshape(n, *axes)
     group = [jnp.zeros_like(logs[0])]
@@ -172,9 +172,9 @@ def graded_multipliers(found: Factored) -> tuple[Array, Array, Array]:
     inside = member[:, None] * member
 
     def blocks(k: int) -> Array:
-        sizes = jnp.exp(jnp.minimum(found.logs[k][:, None] - scale, -math.log(_APART)))
-        left = found.turn[k][:, :, None] * inside * sizes
-        return matmul(left, found.upper[k][:, :, None] * inside)
+        sizes = jnp.exp(jnp.minimum(factored.logs[k][:, None] - scale, -math.log(_APART)))
+        left = factored.turn[k][:, :, None] * inside * sizes
+        return matmul(left, factored.upper[k][:, :, None] * inside)
 
     coarse, fine = blocks(0), blocks(1)
     norm = jnp.sqrt(square_sum(fine))
@@ -186,8 +186,8 @@ def graded_multipliers(found: Factored) -> tuple[Array, Array, Array]:
     leak = jnp.where(jnp.abs(turn) > _SEPARATE, jnp.inf, _COUPLING * ratio)
     leak = jnp.where((place[:, None] > place) & (member == 0), leak, 0.0)
     coupled = over_first(jnp.add, jnp.swapaxes(leak, 0, 1))
-    own = np.finfo(float).eps * _ROUNDINGS * found.rounding[1] + coupled
-    relative = over_first(jnp.maximum, member * own[:, None])
+    separate = np.finfo(float).eps * _ROUNDINGS * factored.rounding[1] + coupled
+    relative = over_first(jnp.maximum, member * separate[:, None])
     changes = jnp.abs(characteristic_coefficients(coarse) - characteristic_coefficients(fine))
     powers = jnp.arange(1, n + 1).reshape(n, *(1,) * rho.ndim)
     error = over_first(jnp.maximum, changes / rho**powers + n * relative * (norm / rho) ** powers)

@@ -73,8 +73,8 @@ def staged(function: Callable[..., Any], *examples: Any) -> Staged:
         values = dict(zip(jaxpr.invars, arguments, strict=True))
         for group, packed in zip(kinds.values(), fixed, strict=True):
             values.update((v, packed[i]) for i, v in enumerate(group))
-        for taken, given, run in parts:
-            values.update(zip(given, stored(run)(*(values[v] for v in taken)), strict=True))
+        for taken, made, run in parts:
+            values.update(zip(made, stored(run)(*(values[v] for v in taken)), strict=True))
         return jax.tree.unflatten(tree, [v.val if isinstance(v, Literal) else values[v] for v in jaxpr.outvars])
 
     return Staged(fixed, moving)
@@ -118,10 +118,12 @@ def _shared_once(equations: Sequence[JaxprEqn], results: Iterable[Any]) -> list[
     return [_part(members[head], [head]) for head in made if head in members]
 
 
-def _part(own: Sequence[JaxprEqn], given: list[Var]) -> tuple[list[Var], list[Var], Callable]:
-    made = {v for equation in own for v in equation.outvars}
-    taken = [v for v in dict.fromkeys(v for e in own for v in e.invars if not isinstance(v, Literal)) if v not in made]
-    return taken, given, _function(taken, given, own)
+def _part(equations: Sequence[JaxprEqn], outputs: list[Var]) -> tuple[list[Var], list[Var], Callable]:
+    made = {v for equation in equations for v in equation.outvars}
+    taken = [
+        v for v in dict.fromkeys(v for e in equations for v in e.invars if not isinstance(v, Literal)) if v not in made
+    ]
+    return taken, outputs, _function(taken, outputs, equations)
 
 
 def _function(
@@ -325,14 +327,15 @@ def _agreeing(
 
     def run(count: Array, records: Array) -> Propagator:
         state = _State.start(n, lanes)
-        for march, own in zip(marches, fixed, strict=True):
-            state = march.through(own, state, count, records)
-        found = state.propagator(len(marches) * count)
-        return found if marches[0].d == n else found._replace(squared=jnp.maximum(found.decay, 0.0) / _STRONG)
+        for march, values in zip(marches, fixed, strict=True):
+            state = march.through(values, state, count, records)
+        propagator = state.propagator(len(marches) * count)
+        squared = propagator.squared if marches[0].d == n else jnp.maximum(propagator.decay, 0.0) / _STRONG
+        return propagator._replace(squared=squared)
 
     def unfinished(state: tuple) -> Array:
-        number, count, propagator, found = state
-        going = ~found.met & (jnp.isfinite(propagator.matrix[0, 0]) | (number < 4))
+        number, count, propagator, z = state
+        going = ~z.met & (jnp.isfinite(propagator.matrix[0, 0]) | (number < 4))
         return (number < 2) | ((number < 2 + _MAX_REFINEMENTS) & (count <= MAX_PANELS) & any_lane(going))
 
     def refine(state: tuple) -> tuple:
@@ -346,16 +349,16 @@ def _agreeing(
         fine = fine._replace(undamped=jnp.where(missed, jnp.inf, undamped))
         # Half as many panels may not show the order yet, unless the system predicts how many it needs: count on less.
         gain = jnp.where(number == 1, count / first, 2.0) ** jnp.where(ratio > 2, ORDER, ORDER - 3)
-        found = jax.lax.cond(
+        z = jax.lax.cond(
             number > 0, lambda: compare(ends, determinant, coarse, fine, len(marches) * count, gain, rtol), lambda: none
         )
-        return number + 1, jnp.where(number == 0, panels, 2 * count), fine, found
+        return number + 1, jnp.where(number == 0, panels, 2 * count), fine, z
 
     first = jnp.maximum(-(-panels // ratio), 1)
     start = _State.start(n, lanes).propagator(first)
     none = jax.tree.map(lambda x: jnp.broadcast_to(x[..., None], (*x.shape, lanes)), unknown(n))
-    _, _, propagator, found = jax.lax.while_loop(unfinished, refine, (jnp.int32(0), first, start, none))
-    return propagator.matrix, found
+    _, _, propagator, z = jax.lax.while_loop(unfinished, refine, (jnp.int32(0), first, start, none))
+    return propagator.matrix, z
 
 
 class Factored(NamedTuple):
@@ -382,9 +385,9 @@ def _factors_of_block(
     mixed = jnp.broadcast_to(np.linalg.qr(np.vander(np.arange(1, n + 1) / n))[0][..., None], (n, n, lanes))
     none = jnp.zeros((n, lanes))
 
-    def through(march: Panels, own: Fixed, count: Array, number: Array, state: Factored) -> Factored:
+    def through(march: Panels, values: Fixed, count: Array, number: Array, state: Factored) -> Factored:
         back = number >= count
-        factor = march.propagator(own, count, jnp.where(back, 2 * count - 1 - number, number))
+        factor = march.propagator(values, count, jnp.where(back, 2 * count - 1 - number, number))
         if ends is not None:
             start, end = ends.reshape(2, n, n, -1)
             factor = jnp.where(back, jnp.swapaxes(factor, 0, 1), factor)
@@ -394,9 +397,9 @@ def _factors_of_block(
 
     def period(count: Array, turn: Array) -> tuple[Factored, Array]:
         state = Factored(turn, none, unit, none)
-        for march, own in zip(marches, fixed, strict=True):
+        for march, values in zip(marches, fixed, strict=True):
             length = count if ends is None else 2 * count
-            state = jax.lax.fori_loop(0, length, partial(through, march, own, count), state)
+            state = jax.lax.fori_loop(0, length, partial(through, march, values, count), state)
         return state._replace(turn=stored(matmul)(jnp.swapaxes(turn, 0, 1), state.turn)), state.turn
 
     def of_count(count: Array) -> Factored:
@@ -421,11 +424,11 @@ def _multiplied(factor: Array, state: Factored) -> Factored:
         columns.append(column / row[j])
         rows.append(jnp.stack(row))
     triangle, turn = jnp.stack(rows, axis=1), jnp.stack(columns, axis=1)
-    own = jnp.stack([triangle[i, i] for i in range(n)])
+    scale = jnp.stack([triangle[i, i] for i in range(n)])
     # The scales of earlier columns are larger, once the subspaces are sorted.
     ratio = jnp.exp(jnp.clip(state.logs - state.logs[:, None], -_FARTHEST, _FARTHEST))
-    upper = matmul(triangle / own[:, None] * ratio, state.upper)
-    return Factored(turn, state.logs + jnp.log(own), upper, state.rounding + norm / own)
+    upper = matmul(triangle / scale[:, None] * ratio, state.upper)
+    return Factored(turn, state.logs + jnp.log(scale), upper, state.rounding + norm / scale)
 
 
 class _State(NamedTuple):

@@ -265,8 +265,8 @@ def spectral_radius(c: Coefficients, split: tuple[_Factor, _Factor] | None = Non
     alone &= ~top.real | (eps < sibling * _at_real(top, top.small, slope, offset))
     error = jnp.where(alone, radius + 4 * EPS * rho, jnp.inf)
     # A double multiplier cannot be bounded better than by the root of the coefficients' own errors.
-    given = ((c.errors[0] * rho + c.errors[1]) * rho + c.errors[2]) * rho + c.errors[3]
-    return rho, error, ~((error * rho) ** 2 < 0.01 * given)
+    bound = ((c.errors[0] * rho + c.errors[1]) * rho + c.errors[2]) * rho + c.errors[3]
+    return rho, error, ~((error * rho) ** 2 < 0.01 * bound)
 
 
 def nothing_crosses(c: Coefficients, log_d: Array) -> Array:

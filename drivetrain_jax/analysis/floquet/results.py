@@ -68,8 +68,8 @@ def radius_in_closed_form(
     """
     lanes = z.shape[-1]
 
-    def closed(given: tuple[Array, Array, Array, Array], _: int) -> tuple[Array, Array, Array]:
-        z, error, scale, undamped = given
+    def closed(block: tuple[Array, Array, Array, Array], _: int) -> tuple[Array, Array, Array]:
+        z, error, scale, undamped = block
         c, norm = _coefficients(z)
         split = quartic.factors(c)
         errors = stored(_errors)(error, jnp.maximum(split[0].large, split[1].large), norm, c.errors[0])
@@ -83,8 +83,8 @@ def radius_in_closed_form(
         chosen = jnp.nonzero(~certain, size=min(lanes, _REPAIRED), fill_value=jnp.argmin(certain))[0]
         spectrum = eigenvalues(z[..., chosen])
         on_circle = all_on_the_circle(*spectrum, error[chosen], scale[chosen])
-        found = *radius_by_eigenvalues(spectrum, error[chosen]), undamped[chosen] & on_circle, True
-        return tuple(x.at[chosen].set(new) for x, new in zip(state, found, strict=True))
+        replaced = *radius_by_eigenvalues(spectrum, error[chosen]), undamped[chosen] & on_circle, True
+        return tuple(x.at[chosen].set(new) for x, new in zip(state, replaced, strict=True))
 
     rho, bound, certain = in_blocks(closed, (z, error, scale, undamped), lanes, _BLOCK, in_one_kernel)
     start = rho, bound, undamped & False, certain
@@ -105,8 +105,8 @@ def _coefficients(z: Array) -> tuple[quartic.Coefficients, Array]:
 
 def _errors(error: Array, size: Array, norm: Array, moved: Array) -> tuple[Array, ...]:
     # The recursion for a_k multiplies k matrices.
-    found = [error * size**k + _ROUNDINGS * quartic.EPS * norm**k for k in (1, 2, 3, 4)]
-    return *found[:3], found[3] + moved
+    errors = [error * size**k + _ROUNDINGS * quartic.EPS * norm**k for k in (1, 2, 3, 4)]
+    return *errors[:3], errors[3] + moved
 
 
 VARIABLES = (
@@ -173,12 +173,12 @@ def _of_multipliers(
         multipliers, errors = jnp.where(better, unit * sigma, multipliers), jnp.where(better, unit * wrong, errors)
         logarithms = jnp.where(better, scale - z.log_scale + jnp.log(jnp.abs(sigma)), logarithms)
     size, known = jnp.exp(z.log_scale), errors < jnp.abs(multipliers)
-    found = {
+    values = {
         "floquet_multiplier": multipliers * size,
         "floquet_multiplier_error": errors * size,
         "floquet_exponent": (logarithms + z.log_scale) / system.span,
     }
-    return {name: jnp.where(known, x, jnp.nan) for name, x in found.items()}
+    return {name: jnp.where(known, x, jnp.nan) for name, x in values.items()}
 
 
 def results(
@@ -217,21 +217,21 @@ def results(
     # Compiled, the largest of moduli that are all NaN may be -inf.
     rho, error = (jnp.where(finite, x, jnp.nan) for x in (rho, error))
     rho, error = jnp.where(bounded, 1 / size, rho), jnp.where(bounded, _ROUNDING / size, error)
-    found: dict[str, Array] = {}
+    values: dict[str, Array] = {}
     if spectrum and wanted & MULTIPLIERS:
-        found = _of_multipliers(z, finite, bounded, spectrum, model.natural, factors)
-    found |= {"spectral_radius": rho * size, "liouville_residual": jnp.where(finite, z.residual, jnp.nan)}
+        values = _of_multipliers(z, finite, bounded, spectrum, model.natural, factors)
+    values |= {"spectral_radius": rho * size, "liouville_residual": jnp.where(finite, z.residual, jnp.nan)}
     met = z.met
     if wanted & NEED_ERROR:
         # A value that underflows is not 0, so its error bound is the smallest number.
         met = (error <= 10 * rtol * rho) & (rho * size >= _TINY)
         bound = jnp.maximum(error * size, _TINY)
-        found |= {
+        values |= {
             "spectral_radius_error": bound,
             "verdict": jnp.where(bounded, 0, verdict(rho * size, bound)).astype(jnp.int8),
         }
     outcome = jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
     outcome = jnp.where(finite, outcome, Outcome.NOT_FINITE)
-    found = {name: found[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}
+    values = {name: values[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}
     # An unknown error has an infinite bound, but multipliers beyond the largest number have no value.
-    return finite_results(found, gaps=MULTIPLIERS, infinite=("spectral_radius_error",))
+    return finite_results(values, gaps=MULTIPLIERS, infinite=("spectral_radius_error",))

@@ -99,8 +99,8 @@ def amplitudes(
         # An empty step ends the loop: the controller has stopped.
         t1 = jnp.where(result == diffrax.RESULTS.successful, jnp.minimum(t1, period), t0)
         between = solver.interpolation_cls(t0=s.t0, t1=s.t1, **dense)
-        found = _peaks_on_step(field, between.evaluate, s.t0, s.t1, s.y, y1, indices)
-        (largest, when), aimed, nearest = _larger_peaks(s, found, keep)
+        peaks = _peaks_on_step(field, between.evaluate, s.t0, s.t1, s.y, y1, indices)
+        (largest, when), aimed, nearest = _larger_peaks(s, peaks, keep)
         again = jnp.any(aimed)
         t0, t1 = jnp.where(again, s.t0, t0), jnp.where(again, nearest, t1)
         y, state, largest, when = jax.tree.map(
@@ -131,15 +131,15 @@ def _at_start(t1: Array, start: Array, indices: tuple[int, ...], solver: Any, co
     return _Peaks(zero, t1, start, largest < 0, largest, 0 * largest, count, jump, solver, control)
 
 
-def _larger_peaks(s: _Peaks, found: _Found, keep: Any) -> tuple[tuple[Array, Array], Array, Array]:
+def _larger_peaks(s: _Peaks, peaks: _Found, keep: Any) -> tuple[tuple[Array, Array], Array, Array]:
     """Largest values and their times after an accepted step, flags of the components with the first new peak in the step,
     and the time of this peak: the step is repeated to end there."""
-    largest = _larger((s.largest, s.when), (found.at_end, s.t1))
-    new = keep & ~jnp.any(s.aimed) & (found.value > largest[0]) & (jnp.abs(found.place - 0.5) < 0.5 - EDGE)
-    nearest = jax.lax.stop_gradient(jnp.min(jnp.where(new, found.place, 1.0)))
-    place = jnp.where(s.aimed, s.t1 + found.late, s.t0 + found.place * (s.t1 - s.t0))
-    largest = _larger(largest, (jnp.where(s.aimed, found.near_end, found.value), place))
-    return largest, new & (found.place == nearest), s.t0 + nearest * (s.t1 - s.t0)
+    largest = _larger((s.largest, s.when), (peaks.at_end, s.t1))
+    new = keep & ~jnp.any(s.aimed) & (peaks.value > largest[0]) & (jnp.abs(peaks.place - 0.5) < 0.5 - EDGE)
+    nearest = jax.lax.stop_gradient(jnp.min(jnp.where(new, peaks.place, 1.0)))
+    place = jnp.where(s.aimed, s.t1 + peaks.late, s.t0 + peaks.place * (s.t1 - s.t0))
+    largest = _larger(largest, (jnp.where(s.aimed, peaks.near_end, peaks.value), place))
+    return largest, new & (peaks.place == nearest), s.t0 + nearest * (s.t1 - s.t0)
 
 
 class _Found(NamedTuple):
@@ -272,13 +272,13 @@ def linear_response(model: ForcedModel, n: int, rtol: float, with_amplitude: boo
     """
     step, unit, forcing = _mapped(model, n, rtol)
     # Without a solution there is nothing to integrate.
-    found = (step.outcome == Outcome.SUCCESS) & jnp.all(jnp.isfinite(unit))
-    unit = jnp.where(found, unit, 0.0)
+    exists = (step.outcome == Outcome.SUCCESS) & jnp.all(jnp.isfinite(unit))
+    unit = jnp.where(exists, unit, 0.0)
     size = size_of(unit)
     start, field, sharp = unit / size, in_units_of(size * forcing, model.linear), _sharpness(rtol, CLOSING_SHARPNESS)
     (largest, phase), correction, closed = _closed(model, field, start, step.matrix, sharp, with_amplitude)
     error = jnp.max(jnp.abs(correction)) + CLOSING_ERROR * sharp * _gain(step.matrix)
-    lost = ~found | ~(error <= NOT_FOUND) | ~_regular(step.matrix, rtol)
+    lost = ~exists | ~(error <= NOT_FOUND) | ~_regular(step.matrix, rtol)
     missed = jnp.where(error > rtol, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
     outcome = _worst(step.outcome, closed, jnp.where(lost, Outcome.NOT_CONVERGED, missed))
     state, error, largest = jax.tree.map(
@@ -353,10 +353,10 @@ def nonlinear_orbit(model: ForcedModel, response: Response, rtol: float, search:
     others = jax.lax.map(partial(_corrected, model, rtol), others)
     every = jax.tree.map(lambda x, more: jnp.concatenate([jnp.asarray(x)[None], more]), first, others)
     every = jax.lax.map(partial(_finished, model, rtol), every)
-    found = every.orbit.outcome < Outcome.NOT_CONVERGED
+    exists = every.orbit.outcome < Outcome.NOT_CONVERGED
     unstable = every.radius > 1 + STABLE_MARGIN
-    best = jnp.lexsort((jnp.max(every.largest, axis=1), unstable, ~found))[0]
-    return jax.tree.map(lambda x: x[jnp.where(jnp.any(found), best, 0)], every)._replace(
+    best = jnp.lexsort((jnp.max(every.largest, axis=1), unstable, ~exists))[0]
+    return jax.tree.map(lambda x: x[jnp.where(jnp.any(exists), best, 0)], every)._replace(
         count=jnp.sum(distinct(every.orbit.state, SAME))
     )
 
@@ -379,33 +379,34 @@ def _corrected(model: ForcedModel, rtol: float, guess: Array) -> Orbit:
 
 def _finished(model: ForcedModel, rtol: float, orbit: Orbit) -> Found:
     """``orbit`` corrected by its closing error, with its largest displacements and its spectral radius."""
-    found = orbit.outcome < Outcome.NOT_CONVERGED
-    state = jnp.where(found, orbit.state, 0.0)
+    exists = orbit.outcome < Outcome.NOT_CONVERGED
+    state = jnp.where(exists, orbit.state, 0.0)
     size = size_of(state)
     field, sharp = in_units_of(size, model.field), _sharpness(rtol, CLOSING_SHARPNESS)
     # A missing orbit is integrated over an empty span.
-    model = replace(model, period=jnp.where(found, model.period, 0.0))
+    model = replace(model, period=jnp.where(exists, model.period, 0.0))
     (largest, phase), correction, closed = _closed(model, field, state / size, orbit.matrix, sharp, True)
     error = size * jnp.max(jnp.abs(correction)) + orbit.error
     missed = jnp.where(error <= rtol * size, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
-    outcome = _worst(orbit.outcome, jnp.where(found, _worst(closed, missed), orbit.outcome))
-    found = outcome < Outcome.NOT_CONVERGED
-    radius = jnp.max(jnp.hypot(*eigenvalues(jnp.where(found, orbit.matrix, jnp.eye(state.size)))))
+    outcome = _worst(orbit.outcome, jnp.where(exists, _worst(closed, missed), orbit.outcome))
+    exists = outcome < Outcome.NOT_CONVERGED
+    radius = jnp.max(jnp.hypot(*eigenvalues(jnp.where(exists, orbit.matrix, jnp.eye(state.size)))))
     state, matrix, error, largest, phase, radius = jax.tree.map(
-        lambda x: jnp.where(found, x, jnp.nan), (state, orbit.matrix, error, size * jnp.asarray(largest), phase, radius)
+        lambda x: jnp.where(exists, x, jnp.nan),
+        (state, orbit.matrix, error, size * jnp.asarray(largest), phase, radius),
     )
-    return Found(Orbit(state, matrix, error, outcome, orbit.corrections), largest, phase, radius, found)
+    return Found(Orbit(state, matrix, error, outcome, orbit.corrections), largest, phase, radius, exists)
 
 
 def _orbit_results(
     model: ForcedModel, response: Response, search: Callable[[Array], Array], rtol: float
 ) -> tuple[dict[str, Any], Array]:
     """Results of the nonlinear orbit and their outcome."""
-    found = nonlinear_orbit(model, response, rtol, search)
-    results = {"orbit_state": found.orbit.state, "orbit_state_error": found.orbit.error}
-    results |= {"orbit_amplitude": found.largest, "orbit_amplitude_phase": found.phase}
-    results |= {"orbit_spectral_radius": found.radius, "orbit_count": found.count.astype(jnp.int32)}
-    return results, found.orbit.outcome
+    best = nonlinear_orbit(model, response, rtol, search)
+    results = {"orbit_state": best.orbit.state, "orbit_state_error": best.orbit.error}
+    results |= {"orbit_amplitude": best.largest, "orbit_amplitude_phase": best.phase}
+    results |= {"orbit_spectral_radius": best.radius, "orbit_count": best.count.astype(jnp.int32)}
+    return results, best.orbit.outcome
 
 
 def _others(build: Build, n: int, speed: str, values: Mapping[str, Any], wanted: Array) -> Array:
@@ -485,17 +486,17 @@ def _derivatives(
     system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
 ) -> dict[str, Array]:
     """Jacobians of states and amplitudes by the variational equations, and of the other results through the solver."""
-    build, found = system.models["forced"].build, {}
+    build, slopes = system.models["forced"].build, {}
     second = tuple(name for name in request.outputs if name in _SECOND)
     if second:
         kept = {name: results[name] for name in second}
         asked = Request(second, request.method, request.options)
-        found |= forward_derivatives(_solvers, system, asked, parameters, constants, kept)
+        slopes |= forward_derivatives(_solvers, system, asked, parameters, constants, kept)
     for prefix, state, top in (("linear", "periodic_state", "amplitude"), ("field", "orbit_state", "orbit_amplitude")):
         if state in request.outputs:
             model = lambda p: build(eqx.combine(p, constants.tree))  # noqa: E731
-            found |= _slopes(model, prefix, parameters, results, (state, top), request.options["rtol"])
-    return found
+            slopes |= _slopes(model, prefix, parameters, results, (state, top), request.options["rtol"])
+    return slopes
 
 
 def _slopes(
@@ -532,18 +533,18 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
 def _of_system(system: type[System]) -> dict[str, Any]:
     """The variables, in the units of the system's state."""
     units, length = ", ".join(dict.fromkeys(c.units for c in system.state)), system.state[0].units
-    each, state = (_displacements(system).name,), ("state",)
+    moving, state = (_displacements(system).name,), ("state",)
     time = system.unit_of_time()
     variables = (
         Variable("periodic_state", units, "periodic solution of the linear system at the start of a period", state),
         Variable("periodic_state_error", units, "estimated absolute error of periodic_state"),
-        Variable("amplitude", length, "largest displacement over the period, linear system", each),
-        Variable("amplitude_phase", time, "time at which the displacement is largest, linear system", each),
+        Variable("amplitude", length, "largest displacement over the period, linear system", moving),
+        Variable("amplitude_phase", time, "time at which the displacement is largest, linear system", moving),
         Variable("condition", "1", "2-norm condition number of I - Z, linear system"),
         Variable("orbit_state", units, "nonlinear periodic orbit at the start of a period", state),
         Variable("orbit_state_error", units, "estimated absolute error of orbit_state"),
-        Variable("orbit_amplitude", length, "largest displacement over the period, nonlinear orbit", each),
-        Variable("orbit_amplitude_phase", time, "time at which the displacement is largest, nonlinear orbit", each),
+        Variable("orbit_amplitude", length, "largest displacement over the period, nonlinear orbit", moving),
+        Variable("orbit_amplitude_phase", time, "time at which the displacement is largest, nonlinear orbit", moving),
         Variable("orbit_spectral_radius", "1", "spectral radius of the monodromy matrix about the nonlinear orbit"),
         Variable("orbit_count", "1", "number of different nonlinear orbits found (0: none)", dtype="int32"),
     )

@@ -321,8 +321,8 @@ def periodic_slopes(
         max_steps=MAX_STEPS,
         throw=False,
     )
-    found = jnp.where(solution.result == diffrax.RESULTS.successful, solution.ys, jnp.nan)  # pyright: ignore[reportArgumentType]
-    on_peaks, end = found[:-1][jnp.argsort(order)], found[-1]
+    values = jnp.where(solution.result == diffrax.RESULTS.successful, solution.ys, jnp.nan)  # pyright: ignore[reportArgumentType]
+    on_peaks, end = values[:-1][jnp.argsort(order)], values[-1]
     moved = solve(jnp.eye(n) - end[1 : n + 1].T, end[n + 1 :].T)
     tops = [
         jnp.sign(rows[0, i]) * (rows[1 : n + 1, i] @ moved + rows[n + 1 :, i])
@@ -390,7 +390,7 @@ def neighbours(model_at: Callable[[Any], ForcedModel], speed: Array, n: int) -> 
     far = speed * jnp.array([1 / REACH, REACH])
     x = jnp.concatenate([jnp.zeros((n, 2)), far[None]])
     scale = jnp.concatenate([jnp.ones((n, 2)), jnp.full((1, 2), speed)])
-    found = follow(
+    branch = follow(
         jax.vmap(lambda x: speed_map(model_at, x, _RTOL), 1, -1),
         x,
         scale,
@@ -401,5 +401,5 @@ def neighbours(model_at: Callable[[Any], ForcedModel], speed: Array, n: int) -> 
         converged=_CONVERGED,
         special=False,
     )
-    guess, exists, _ = sections(course(found.x, scale), speed, _EACH)
+    guess, exists, _ = sections(course(branch.x, scale), speed, _EACH)
     return jnp.where(exists[:, None], guess, jnp.nan)[:, :n].transpose(0, 2, 1).reshape(-1, n)

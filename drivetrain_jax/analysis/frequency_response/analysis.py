@@ -68,11 +68,11 @@ def _branch_variables(system: type[System]) -> tuple[Variable, ...]:
     """Variables of the branches, in the units of the system's displacements."""
     assert system.displacements is not None  # System refuses a model of forced without them
     units, speed = system.state[0].units, system.parameter(system.role("speed")).units
-    own = ("branch",)
+    branch = ("branch",)
     return (
-        Variable("branch_amplitude", units, "largest displacement of the orbits", (*own, system.displacements.name)),
-        Variable("branch_spectral_radius", "1", "spectral radius of the monodromy matrix about the orbits", own),
-        Variable("branch_stability", "1", "stability of the orbits", own, dtype="int8", flags=STABILITY),
+        Variable("branch_amplitude", units, "largest displacement of the orbits", (*branch, system.displacements.name)),
+        Variable("branch_spectral_radius", "1", "spectral radius of the monodromy matrix about the orbits", branch),
+        Variable("branch_stability", "1", "stability of the orbits", branch, dtype="int8", flags=STABILITY),
         Variable("fold_frequency", speed, "speeds at which branches turn back, rising", ("fold",)),
         Variable("doubling_frequency", speed, "speeds at which periods double, rising", ("doubling",)),
     )
@@ -109,18 +109,18 @@ def _solve_branches(
     special = not {"fold_frequency", "doubling_frequency"}.isdisjoint(request.outputs)
     guesses, every, frequencies = _branches_of_orbits(model_at, rising, n, special)
 
-    def at(each: tuple[Array, Array, Array]) -> tuple[Array, ...]:
-        value, guess, every = each
-        found = orbits_near(model_at(value), guess, request.options["rtol"])
-        exists = distinct(found.orbit.state, SAME)
-        order = jnp.lexsort((jnp.max(found.largest, axis=1), ~exists))
+    def at(section: tuple[Array, Array, Array]) -> tuple[Array, ...]:
+        value, guess, every = section
+        orbits = orbits_near(model_at(value), guess, request.options["rtol"])
+        exists = distinct(orbits.orbit.state, SAME)
+        order = jnp.lexsort((jnp.max(orbits.largest, axis=1), ~exists))
         exists = exists[order]
-        largest = jnp.where(exists[:, None], found.largest[order], jnp.nan)
-        radius = jnp.where(exists, found.radius[order], jnp.nan)
+        largest = jnp.where(exists[:, None], orbits.largest[order], jnp.nan)
+        radius = jnp.where(exists, orbits.radius[order], jnp.nan)
         stability = jnp.where(radius > 1 + STABLE_MARGIN, UNSTABLE, STABLE)
         stability = jnp.where(exists, stability, ABSENT).astype(jnp.int8)
-        missed = jnp.any(exists & (found.orbit.outcome[order] != Outcome.SUCCESS))
-        lost = jnp.any(jnp.isfinite(guess[:, 0]) & jnp.isnan(found.radius))
+        missed = jnp.any(exists & (orbits.orbit.outcome[order] != Outcome.SUCCESS))
+        lost = jnp.any(jnp.isfinite(guess[:, 0]) & jnp.isnan(orbits.radius))
         outcome = jnp.where(missed | lost | ~every, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
         outcome = jnp.where(jnp.any(exists), outcome, Outcome.NOT_CONVERGED)
         return largest, radius, stability, outcome.astype(jnp.int8)
@@ -143,7 +143,7 @@ def _branches_of_orbits(
     x = jnp.concatenate([jnp.zeros((n, at.size)), at[None]])
     scale = jnp.concatenate([jnp.ones((n, at.size)), at[None]])
     mapped = jax.vmap(lambda x: speed_map(model_at, x, _RTOL, _STEPS), 1, -1)
-    found = follow(
+    branch = follow(
         mapped,
         x,
         scale,
@@ -153,7 +153,7 @@ def _branches_of_orbits(
         limits=(jnp.maximum(at / REACH, low) * (1 - 1e-9), jnp.minimum(at * REACH, high) * (1 + 1e-9)),
         converged=1e-9,
     )
-    along = course(found.x, scale)
+    along = course(branch.x, scale)
 
     def positions(value: Array) -> tuple[Array, Array]:
         guess, exists, every = sections(along, value, _EACH)
@@ -165,7 +165,7 @@ def _branches_of_orbits(
     guesses, every = jax.lax.map(positions, jnp.asarray(rising))
     frequencies: dict[str, Array] = {}
     if special:
-        p, complete = folds_and_doublings(lambda _: mapped, found, (low, high), _EACH_SPECIAL, _MOST_SPECIAL, at.size)
+        p, complete = folds_and_doublings(lambda _: mapped, branch, (low, high), _EACH_SPECIAL, _MOST_SPECIAL, at.size)
         frequencies |= zip(("fold_frequency", "doubling_frequency"), p[..., 0], strict=True)
         every &= complete[0]
     return guesses, every, frequencies
@@ -290,8 +290,8 @@ def _solve(
         basis = Basis(options["harmonics"], options["subharmonic"], options["samples"])
         results = harmonic_response.response(model, basis, shape, request.outputs)
     else:
-        given = options.get("fit_range", 0.0)
-        fit_range = given / unit if given > 0 else None
+        asked = options.get("fit_range", 0.0)
+        fit_range = asked / unit if asked > 0 else None
         results = closed_form_response.response(model, request.method, fit_range, shape, request.outputs)
     results = from_scaled_length(results, unit)
     if request.method != "exact":
@@ -317,39 +317,39 @@ def _without(lost: Array, results: Mapping[str, Array]) -> dict[str, Array]:
     def kept(x: Array, nothing: Any) -> Array:
         return jnp.where(jnp.expand_dims(lost, tuple(range(1, 1 + x.ndim - lost.ndim))), nothing, x).astype(x.dtype)
 
-    found = {name: kept(x, jnp.nan) for name, x in results.items() if jnp.issubdtype(x.dtype, jnp.inexact)}
-    return found | {name: kept(x, ABSENT) for name, x in results.items() if name.endswith("stability")}
+    numbers = {name: kept(x, jnp.nan) for name, x in results.items() if jnp.issubdtype(x.dtype, jnp.inexact)}
+    return numbers | {name: kept(x, ABSENT) for name, x in results.items() if name.endswith("stability")}
 
 
 def _exact(model: PiecewiseLinearOscillator, request: Request) -> dict[str, Array]:
     """The frequencies in rising order, and indices back to the path."""
     rising, place = np.unique(np.asarray(model.omega), return_inverse=True)
-    found = exact_response.sweeps(
+    motions = exact_response.sweeps(
         replace(model, omega=rising),
         most_periods=request.options["most_periods"],
         rtol=request.options["rtol"],
         integrals=not exact_response.INTEGRALS.isdisjoint(request.outputs),
     )
-    outcome = exact_response.worst(found["outcome"])
+    outcome = exact_response.worst(motions["outcome"])
     special = not _SPECIAL.isdisjoint(request.outputs)
     if special or any(name.startswith("branch_") for name in request.outputs):
-        results, complete = _exact_branch(model, rising, found, special)
-        found |= results
+        results, complete = _exact_branch(model, rising, motions, special)
+        motions |= results
         outcome = jnp.where(~complete & (outcome == Outcome.SUCCESS), Outcome.TOLERANCE_NOT_MET, outcome)
-    results = {name: found[name][place] for name in request.outputs}
+    results = {name: motions[name][place] for name in request.outputs}
     return results | {"outcome": outcome[place].astype(jnp.int8)}
 
 
 def _exact_branch(
-    model: PiecewiseLinearOscillator, rising: np.ndarray, found: dict[str, Array], special: bool
+    model: PiecewiseLinearOscillator, rising: np.ndarray, motions: dict[str, Array], special: bool
 ) -> tuple[dict[str, Array], Array]:
     """The branch through the first motion of period one of the sweep up, and flags of the frequencies where it is
     complete."""
     shape = _shape(model)
     lanes = int(np.prod(shape, dtype=int))
-    single = found["period_multiple"][:, 0].reshape(-1, lanes) == 1
+    single = motions["period_multiple"][:, 0].reshape(-1, lanes) == 1
     first = jnp.argmax(single, axis=0)
-    state = found["orbit_state"][:, 0].reshape(-1, 2, lanes)
+    state = motions["orbit_state"][:, 0].reshape(-1, 2, lanes)
     state = jnp.take_along_axis(state, first[None, None], axis=0)[0]
     x = jnp.concatenate([state, jnp.asarray(rising)[first][None]])
     x = jnp.where(jnp.any(single, axis=0), x, jnp.nan)

@@ -117,9 +117,9 @@ def self_consistent_range(model: PiecewiseLinearOscillator, shape: tuple[int, ..
     beyond = model.b / jnp.where(r > 0, r, 1.0)
     # Without a change of sign the peak lies within the play, where the spring is linear.
     within = target / jnp.sqrt(model.stiffness * model.alpha)
-    found = jnp.where(jnp.any(mask, axis=(0, 1)), beyond, within)
-    found = jnp.where(model.b > 0, found, linear)
-    return jnp.where(model.damping > 0, found, jnp.inf)
+    fit_range = jnp.where(jnp.any(mask, axis=(0, 1)), beyond, within)
+    fit_range = jnp.where(model.b > 0, fit_range, linear)
+    return jnp.where(model.damping > 0, fit_range, jnp.inf)
 
 
 def slow_flow(model: PiecewiseLinearOscillator, fit: Cubic) -> SlowFlow:
@@ -193,8 +193,8 @@ def roots(flow: SlowFlow, omega: Array) -> Array:
     positive = (residual(points) > 0).at[0].set(False).at[-1].set(True)
     mask = sign_changes(positive, MOST_ROOTS)
     turned = jnp.where(take(mask, positive[1:], 1.0) > 0, 1.0, -1.0)
-    found = bisect(lambda x: turned * residual(x), take(mask, points[:-1]), take(mask, points[1:]))
-    amplitude = jnp.where(jnp.any(mask, axis=1), jnp.exp(found / 2), jnp.inf)
+    log_square = bisect(lambda x: turned * residual(x), take(mask, points[:-1]), take(mask, points[1:]))
+    amplitude = jnp.where(jnp.any(mask, axis=1), jnp.exp(log_square / 2), jnp.inf)
     alone = jnp.full_like(amplitude, jnp.inf)
     # A linear spring has one amplitude, infinite at resonance without damping; without drive the only motion is rest.
     linear = alone.at[0].set(flow.drive / jnp.hypot(delta, flow.decay))
@@ -246,8 +246,8 @@ class Curves(NamedTuple):
 
 def of_multiple_scales(model: PiecewiseLinearOscillator, shape: tuple[int, ...], fit_range: Array | None) -> Curves:
     """Response by the corrected closed form of the paper, for ``fit_range`` [m] or else the self-consistent range."""
-    own = self_consistent_range(model, shape) if fit_range is None else fit_range
-    fit = cubic_fit(model, jnp.broadcast_to(own, shape))
+    chosen = self_consistent_range(model, shape) if fit_range is None else fit_range
+    fit = cubic_fit(model, jnp.broadcast_to(chosen, shape))
     flow = slow_flow(model, fit)
 
     def motions(omega: Any) -> OneTerm:

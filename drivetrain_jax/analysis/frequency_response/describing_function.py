@@ -280,15 +280,15 @@ def skeleton(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Skelet
             return turned * arm_slope(model, amplitude, point, sign)
 
         folds.append(bisect(uphill, low, high, 45))
-    found = jnp.concatenate(folds)
-    amplitudes = jnp.sort(jnp.concatenate([nodes, jnp.where(jnp.isnan(found), end, found)]), axis=0)
+    turning = jnp.concatenate(folds)
+    amplitudes = jnp.sort(jnp.concatenate([nodes, jnp.where(jnp.isnan(turning), end, turning)]), axis=0)
     amplitudes = jnp.concatenate([jnp.zeros((1, *shape)), amplitudes])
     safe = jnp.maximum(amplitudes, _TINY)
     points = point_at(model, safe, bias_of(model, safe))
     centre, half = points.stiffness - model.damping**2 / 2, _half_width(model, safe, points.stiffness, top)
     # The amplitude 0 lies below every solution, also without a drive.
     half = half.at[0].set(jnp.inf)
-    return Skeleton(amplitudes, points, (centre - half, centre + half), top, found, limit)
+    return Skeleton(amplitudes, points, (centre - half, centre + half), top, turning, limit)
 
 
 def peak_of(model: PiecewiseLinearOscillator, bones: Skeleton) -> tuple[Array, Array]:
@@ -324,8 +324,8 @@ def backbone(model: PiecewiseLinearOscillator, shape: tuple[int, ...], omega: Ar
         mask = sign_changes(above[::-1], 1)[:, ::-1]
         low, high, stiffness = _interpolated(amplitudes, points, mask)
         rising = jnp.where(take(mask, above[1:], 1.0) > 0, 1.0, -1.0)
-        found = bisect(lambda a: rising * (stiffness(a) - omega**2), low, high, _HALVINGS)
-        bias = _bias_between(points, mask, (found - low) / (high - low))
+        amplitude_at = bisect(lambda a: rising * (stiffness(a) - omega**2), low, high, _HALVINGS)
+        bias = _bias_between(points, mask, (amplitude_at - low) / (high - low))
 
         def polish(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
             amplitude, bias = state
@@ -333,7 +333,7 @@ def backbone(model: PiecewiseLinearOscillator, shape: tuple[int, ...], omega: Ar
             point = point_at(free, amplitude, bias)
             return jnp.clip(amplitude - (point.stiffness - omega**2) / point.slope, low, high), bias
 
-        return jax.lax.fori_loop(0, _POLISH_STEPS, polish, (found, bias))[0][0]
+        return jax.lax.fori_loop(0, _POLISH_STEPS, polish, (amplitude_at, bias))[0][0]
 
     return jax.lax.map(largest, omega)
 
@@ -398,9 +398,9 @@ def roots(model: PiecewiseLinearOscillator, bones: Skeleton, omega: Array) -> tu
     def above(amplitude: Array) -> Array:
         return turned * _arm_gap(model, square, amplitude, stiffness(amplitude), sign)[0]
 
-    found = jnp.maximum(bisect(above, low, high, _HALVINGS), _TINY)
-    bias = _bias_between(bones.points, mask, (found - low) / jnp.where(high > low, high - low, 1.0))
-    bias = improved(model, found, bias)
+    amplitude_near = jnp.maximum(bisect(above, low, high, _HALVINGS), _TINY)
+    bias = _bias_between(bones.points, mask, (amplitude_near - low) / jnp.where(high > low, high - low, 1.0))
+    bias = improved(model, amplitude_near, bias)
 
     def polish(_: int, state: tuple[Array, ...]) -> tuple[Array, ...]:
         low, high, amplitude, bias = state
@@ -417,15 +417,15 @@ def roots(model: PiecewiseLinearOscillator, bones: Skeleton, omega: Array) -> tu
         inside = (trial >= low - slack) & (trial <= high + slack)
         return low, high, jnp.maximum(jnp.where(inside, trial, (low + high) / 2), _TINY), bias
 
-    _, _, found, bias = jax.lax.fori_loop(0, _POLISH_STEPS, polish, (low, high, found, bias))
-    exists = jnp.any(mask, axis=1) & (found < bones.limit)
-    order = jnp.argsort(jnp.where(exists, found, jnp.inf), axis=0)
-    found, bias, exists = (jnp.take_along_axis(part, order, axis=0) for part in (found, bias, exists))
-    point = point_at(model, found, improved(model, found, bias))
+    _, _, amplitude_near, bias = jax.lax.fori_loop(0, _POLISH_STEPS, polish, (low, high, amplitude_near, bias))
+    exists = jnp.any(mask, axis=1) & (amplitude_near < bones.limit)
+    order = jnp.argsort(jnp.where(exists, amplitude_near, jnp.inf), axis=0)
+    amplitude_near, bias, exists = (jnp.take_along_axis(part, order, axis=0) for part in (amplitude_near, bias, exists))
+    point = point_at(model, amplitude_near, improved(model, amplitude_near, bias))
     # Without drive the only motion is rest.
     driven = model.B1 != 0
-    number = jnp.arange(MOST_ROOTS).reshape(-1, *(1,) * (found.ndim - 1))
-    amplitude = jnp.where(driven, found, 0.0)
+    number = jnp.arange(MOST_ROOTS).reshape(-1, *(1,) * (amplitude_near.ndim - 1))
+    amplitude = jnp.where(driven, amplitude_near, 0.0)
     return jnp.where(exists & (driven | (number == 0)), amplitude, jnp.inf), point
 
 

@@ -78,11 +78,11 @@ def at_frequency(
     guess, exists, every = sections(branch, omega, count)
 
     def improved(x: Array) -> tuple[Array, Array, Array]:
-        found = balance(model, basis, x, omega + jnp.zeros(x.shape[1:]), _POLISH)
-        return found.x, found.converged, found.saddle
+        balanced = balance(model, basis, x, omega + jnp.zeros(x.shape[1:]), _POLISH)
+        return balanced.x, balanced.converged, balanced.saddle
 
-    found, converged, saddle = jax.lax.map(improved, guess[:, :-1])
-    return found, exists & converged, saddle, every & jnp.all(converged | ~exists, axis=0)
+    motions, converged, saddle = jax.lax.map(improved, guess[:, :-1])
+    return motions, exists & converged, saddle, every & jnp.all(converged | ~exists, axis=0)
 
 
 # Slow sweeps of the drive's frequency by harmonic balance.
@@ -177,14 +177,14 @@ def _runge_kutta(
     return u + h * total_u, v + h * total_v
 
 
-def _checked(model: PiecewiseLinearOscillator, basis: Basis, found: Balanced, omega: Array) -> tuple[Swept, Array]:
+def _checked(model: PiecewiseLinearOscillator, basis: Basis, balanced: Balanced, omega: Array) -> tuple[Swept, Array]:
     """A balanced motion with its half trace, and a flag: true if it is an attractor within the basis."""
-    half = half_trace(model, basis, omega, contact(model, basis, found.x))
+    half = half_trace(model, basis, omega, contact(model, basis, balanced.x))
     growth = spectral_radius(model, basis, omega, half)
     # Without subharmonics the basis has no motion of doubled period.
     followed = (half > 1) | (basis.order > 1)
-    attracts = found.converged & ~found.saddle & ~((growth > 1 + _GROWS) & followed)
-    return Swept(found.x, half, found.converged, found.saddle), attracts
+    attracts = balanced.converged & ~balanced.saddle & ~((growth > 1 + _GROWS) & followed)
+    return Swept(balanced.x, half, balanced.converged, balanced.saddle), attracts
 
 
 def _kept(condition: Array, first: Swept, second: Swept) -> Swept:
@@ -215,8 +215,8 @@ def step(
             lambda seed: seed,
             seed,
         )
-        found = drift(model, basis, jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, seed), omega)
-        return jnp.where(lost, jnp.where(jnp.all(jnp.isfinite(found), axis=0), found, seed), now.x)
+        settled = drift(model, basis, jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, seed), omega)
+        return jnp.where(lost, jnp.where(jnp.all(jnp.isfinite(settled), axis=0), settled, seed), now.x)
 
     def attempt(state: tuple[Array, Array, Array, Array, Swept]) -> tuple[Array, Array, Array, Array, Swept]:
         count, lost, settled, seed, now = state
@@ -347,10 +347,10 @@ def response(
     """
     omega = np.asarray(model.omega)
     lanes = shape or (1,)
-    own = {name: value for name, value in vars(model).items() if name not in ("omega", "damps_play")}
+    values = {name: value for name, value in vars(model).items() if name not in ("omega", "damps_play")}
     if not model.follows:
-        del own["unbalance"]
-    fields = {name: jnp.broadcast_to(value, lanes) for name, value in own.items()}
+        del values["unbalance"]
+    fields = {name: jnp.broadcast_to(value, lanes) for name, value in values.items()}
     model = replace(model, **fields, omega=None)
     swept_x, balanced, saddle = _sweeps(model, basis, omega, lanes)
 
@@ -364,8 +364,8 @@ def response(
     if any(name.startswith("branch_") for name in outputs):
         # The branch starts at the highest frequency, where motions are simplest.
         first = swept_x[int(np.argmax(omega)), 1]
-        found, complete = _branches(model, basis, omega, first)
-        results |= found
+        branches, complete = _branches(model, basis, omega, first)
+        results |= branches
         outcome = jnp.where(~complete & (outcome == Outcome.SUCCESS), Outcome.TOLERANCE_NOT_MET, outcome)
     results = {name: results[name] for name in outputs} | {"outcome": outcome.astype(jnp.int8)}
     return results if shape else {name: value[..., 0] for name, value in results.items()}
@@ -410,10 +410,10 @@ def _branches(
     def at(frequency: Array) -> tuple[Array, Array, Array, Array]:
         x, exists, saddle, every = at_frequency(model, basis, along, frequency, BRANCHES)
         wide = jnp.broadcast_to(frequency, lanes)
-        found = jax.lax.map(lambda one: describe(model, basis, one[0], wide, *one[1:]), (x, exists, saddle))
-        order = jnp.argsort(found.u_max, axis=0)
+        motions = jax.lax.map(lambda one: describe(model, basis, one[0], wide, *one[1:]), (x, exists, saddle))
+        order = jnp.argsort(motions.u_max, axis=0)
         high, low, stability = (
-            jnp.take_along_axis(v, order, axis=0) for v in (found.u_max, found.u_min, found.stability)
+            jnp.take_along_axis(v, order, axis=0) for v in (motions.u_max, motions.u_min, motions.stability)
         )
         return high, low, stability, every & distinct(high, low)
 

@@ -192,8 +192,8 @@ _MAX_PERIODS, _PLAY_CHUNK = 2_000_000, 64
 
 def _play_variables(system: type[System]) -> tuple[Variable, ...]:
     """Variables of the state of ``system``, and those that the methods add."""
-    own = (Variable(c.name, c.units, c.long_name, ("time",)) for c in system.state)
-    return (*own, *_EXACT, *_AVERAGED)
+    of_state = (Variable(c.name, c.units, c.long_name, ("time",)) for c in system.state)
+    return (*of_state, *_EXACT, *_AVERAGED)
 
 
 def _play_dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
@@ -234,10 +234,10 @@ def _exact(system: type[System], request: Request, values: Mapping[str, Any], ef
     """The requested results of a batch, lanes last; ``effort`` only orders the batches."""
     times = np.array(requested_times(request))
     model: PiecewiseLinearOscillator = system.models["history"].build(values)
-    given = [values[system.role(role)] for role in _STARTS]
-    shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in (*vars(model).values(), *given)))
+    starts = [values[system.role(role)] for role in _STARTS]
+    shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in (*vars(model).values(), *starts)))
     scaled, unit = to_scaled_length(model)
-    u0, v0 = (jnp.broadcast_to(jnp.asarray(x, float) / unit, shape or (1,)) for x in given)
+    u0, v0 = (jnp.broadcast_to(jnp.asarray(x, float) / unit, shape or (1,)) for x in starts)
     u, v, events, stuck = timed_motion(scaled, u0, v0, times, request.options["most_events"])
     finite = jnp.all(jnp.isfinite(u), axis=0)
     outcome = jnp.where(stuck, Outcome.STEP_LIMIT, jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE))
@@ -275,25 +275,25 @@ def _averaged(system: type[System], request: Request, values: Mapping[str, Any],
     model.check_method(model.damps_play, request.method)
     u0, v0 = (jnp.asarray(values[system.role(role)], float) for role in _STARTS)
     scaled, unit = to_scaled_length(model)
-    given = request.options["fit_range"]
-    flow, frequency = averaged_flow(scaled, jnp.asarray(given / unit) if given > 0 else None, u0 / unit, v0 / unit)
-    found = integrated(flow, request)
-    real, imaginary = found.states.T * unit
+    asked = request.options["fit_range"]
+    flow, frequency = averaged_flow(scaled, jnp.asarray(asked / unit) if asked > 0 else None, u0 / unit, v0 / unit)
+    history = integrated(flow, request)
+    real, imaginary = history.states.T * unit
     turned = model.omega * jnp.asarray(requested_times(request))
     cosine, sine = jnp.cos(turned), jnp.sin(turned)
     u, v = real * cosine + imaginary * sine, frequency * (imaginary * cosine - real * sine)
     results = dict(zip((c.name for c in system.state), (u, v), strict=True))
     results |= {"amplitude": jnp.hypot(real, imaginary), "phase": jnp.arctan2(imaginary, real)}
-    return finite_results({name: results[name] for name in request.outputs} | {"outcome": _outcome(flow, found)})
+    return finite_results({name: results[name] for name in request.outputs} | {"outcome": _outcome(flow, history)})
 
 
 def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """All requested results of one point; ``effort`` only orders the batches, as the integration is adaptive."""
     flow: Flow = system.models["history"].build(values)
-    found = integrated(flow, request)
+    history = integrated(flow, request)
     scale = jnp.stack([jnp.asarray(s, float) for s in flow.scale or (1.0,) * flow.size])
-    results = _by_component(system, scale * found.states, "") | _by_component(system, scale * found.error, "_error")
-    return {name: results[name] for name in request.outputs} | {"outcome": _outcome(flow, found)}
+    results = _by_component(system, scale * history.states, "") | _by_component(system, scale * history.error, "_error")
+    return {name: results[name] for name in request.outputs} | {"outcome": _outcome(flow, history)}
 
 
 def _by_component(system: type[System], values: Array, suffix: str) -> dict[str, Array]:
@@ -318,11 +318,11 @@ def _period(build: Callable[..., Any], size: int | None, values: Mapping[str, An
     return jnp.asarray(flow.period)
 
 
-def _outcome(flow: Flow, found: History) -> Array:
+def _outcome(flow: Flow, history: History) -> Array:
     """The outcome of the integration of ``flow``, int8."""
-    outcome = jnp.where(found.excess <= 1, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
+    outcome = jnp.where(history.excess <= 1, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
     failed = jnp.where(has_finite_start(flow), Outcome.STEP_LIMIT, Outcome.NOT_FINITE)
-    return jnp.where(found.healthy, outcome, failed).astype(jnp.int8)
+    return jnp.where(history.healthy, outcome, failed).astype(jnp.int8)
 
 
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:

@@ -280,20 +280,20 @@ def integrated(flow: Flow, request: Request) -> History:
     times = jnp.asarray(requested_times(request))
     limits = limits_of(request)
 
-    def sharper(found: History) -> Array:
-        return found.tolerance * _RESERVE / found.excess
+    def sharper(history: History) -> Array:
+        return history.tolerance * _RESERVE / history.excess
 
-    def missed(found: History) -> Array:
-        hopeful = (found.excess > 1) & (sharper(found) >= _SHARPEST_AGAIN) & (found.attempts < _MOST_ATTEMPTS)
-        hopeful &= found.steps <= _REPEATABLE * limits.steps
-        return (found.attempts == 0) | (found.healthy & hopeful)
+    def missed(history: History) -> Array:
+        hopeful = (history.excess > 1) & (sharper(history) >= _SHARPEST_AGAIN) & (history.attempts < _MOST_ATTEMPTS)
+        hopeful &= history.steps <= _REPEATABLE * limits.steps
+        return (history.attempts == 0) | (history.healthy & hopeful)
 
-    def attempt(found: History) -> History:
-        first = found.attempts == 0
-        tolerance = jnp.where(missed(found) & ~first, sharper(found), found.tolerance)
-        new = _twice(flow, times, tolerance, found.attempts, request)
-        better = first | (new.excess < found.excess)
-        kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, found)
+    def attempt(history: History) -> History:
+        first = history.attempts == 0
+        tolerance = jnp.where(missed(history) & ~first, sharper(history), history.tolerance)
+        new = _twice(flow, times, tolerance, history.attempts, request)
+        better = first | (new.excess < history.excess)
+        kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, history)
         return kept._replace(attempts=new.attempts)
 
     nothing = jnp.full((len(times), flow.size), jnp.nan)

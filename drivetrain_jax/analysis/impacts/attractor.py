@@ -497,8 +497,10 @@ def _rounding(lanes: Lanes, motion: Motion, state: tuple[Array, Array], omega: A
 def _taken_off(lanes: Lanes, motion: Motion) -> Array:
     """Largest harmonic response that steps subtract from the displacement, which limits their accuracy."""
     here = locate(lanes, motion.u)
-    own, contact, gap = (jnp.hypot(piece.cosine, piece.sine) for piece in (here.region, lanes.contact, lanes.gap))
-    return jnp.where(stays(lanes, here, motion), own, jnp.maximum(contact, gap))
+    here_removed, contact, gap = (
+        jnp.hypot(piece.cosine, piece.sine) for piece in (here.region, lanes.contact, lanes.gap)
+    )
+    return jnp.where(stays(lanes, here, motion), here_removed, jnp.maximum(contact, gap))
 
 
 class _Work(NamedTuple):

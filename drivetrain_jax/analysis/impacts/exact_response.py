@@ -58,13 +58,13 @@ WIDTH, _SWEEP_WIDTH = 64, 32
 
 def describe(
     oscillator: PiecewiseLinearOscillator,
-    found: Attractors,
+    motions: Attractors,
     *,
     rtol: float,
     integrals: bool = True,
     largest: Any = jnp.inf,
 ) -> dict[str, Array]:
-    """All results of the motions ``found``, every field of shape ``(N,)`` as those of ``oscillator``.
+    """All results of ``motions``, every field of shape ``(N,)`` as those of ``oscillator``.
 
     Impacts, contacts, states and multipliers are pairs, ``(2, N)``. Unknown values are NaN (``stability``: absent).
 
@@ -74,33 +74,36 @@ def describe(
     ``outcome`` is TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its size, or a thousandth of the
     largest distance from the flanks, and NOT_FINITE where its size exceeds ``largest``.
     """
-    stopped = found.stalled == 1
-    u, v = jnp.where(stopped, jnp.nan, found.u), found.v
-    seen = measure(oscillator, u, v, found.multiple, width=WIDTH, integrals=integrals)
-    periodic = found.multiple > 0
-    wild = ~periodic & (found.exponent * averaged(found.periods) * oscillator.period > _WILD)
+    stopped = motions.stalled == 1
+    u, v = jnp.where(stopped, jnp.nan, motions.u), motions.v
+    seen = measure(oscillator, u, v, motions.multiple, width=WIDTH, integrals=integrals)
+    periodic = motions.multiple > 0
+    wild = ~periodic & (motions.exponent * averaged(motions.periods) * oscillator.period > _WILD)
     size = jnp.maximum(jnp.abs(seen.high), jnp.abs(seen.low))
     # Not the size of u: at a wide backlash the motion about a flank is far from the origin.
     away = jnp.maximum(*(jnp.abs(jnp.abs(u) - oscillator.b) for u in (seen.high, seen.low)))
-    exact = (found.error <= rtol * size) & (found.error <= _DECIDES * away)
+    exact = (motions.error <= rtol * size) & (motions.error <= _DECIDES * away)
     outcome = jnp.where(periodic & ~exact, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
     results = periodic_results(oscillator, seen)
     unstable = periodic & (results["spectral_radius"] > 1 + _UNSTABLE)
     outcome = jnp.where((periodic | wild) & ~unstable, outcome, Outcome.NOT_CONVERGED)
-    outcome = jnp.where((found.stalled > 0) | (seen.complete == 0), Outcome.STEP_LIMIT, outcome)
-    finite = jnp.isfinite(found.u) & (stopped | (jnp.isfinite(seen.high + seen.low) & (size <= largest)))
+    outcome = jnp.where((motions.stalled > 0) | (seen.complete == 0), Outcome.STEP_LIMIT, outcome)
+    finite = jnp.isfinite(motions.u) & (stopped | (jnp.isfinite(seen.high + seen.low) & (size <= largest)))
     outcome = jnp.where(finite, outcome, Outcome.NOT_FINITE)
     known = outcome < Outcome.NOT_CONVERGED
     results |= {name: jnp.where(periodic, results[name], jnp.nan) for name in ("floquet_multiplier", "spectral_radius")}
-    results["lyapunov_exponent"] = jnp.where(periodic, results["lyapunov_exponent"], found.exponent)
-    results |= {"orbit_state": jnp.stack([found.u, found.v]), "state_error": jnp.where(periodic, found.error, jnp.nan)}
+    results["lyapunov_exponent"] = jnp.where(periodic, results["lyapunov_exponent"], motions.exponent)
+    results |= {
+        "orbit_state": jnp.stack([motions.u, motions.v]),
+        "state_error": jnp.where(periodic, motions.error, jnp.nan),
+    }
     results = {name: jnp.where(known, value, jnp.nan) for name, value in results.items()}
     kind = jnp.where(periodic, regime(oscillator, seen.high, seen.low), NON_PERIODIC)
     return results | {
         "regime": jnp.where(known, kind, NON_PERIODIC).astype(jnp.int8),
         "stability": jnp.where(known, jnp.where(periodic, STABLE, UNSTABLE), ABSENT).astype(jnp.int8),
         "period_multiple": jnp.where(periodic & known, seen.periods, 0).astype(jnp.int32),
-        "periods_settled": found.periods,
+        "periods_settled": motions.periods,
         "outcome": outcome.astype(jnp.int8),
     }
 
@@ -156,16 +159,16 @@ def sweeps(
     up = np.arange(length * lanes, dtype=np.int32).reshape(length, lanes).T
     route = np.concatenate([up, up[:, ::-1]])
     rest = jnp.zeros(2 * lanes)
-    found = attractors(points, jnp.asarray(route), rest, rest, most_periods=most_periods, width=_SWEEP_WIDTH)
-    flat = jax.tree.map(lambda x: x.reshape(-1), found)
+    motions = attractors(points, jnp.asarray(route), rest, rest, most_periods=most_periods, width=_SWEEP_WIDTH)
+    flat = jax.tree.map(lambda x: x.reshape(-1), motions)
     results = describe(take(points, jnp.asarray(route.reshape(-1))), flat, rtol=rtol, integrals=integrals)
 
     def arrange(x: Array) -> Array:
-        own = x.shape[:-1]
-        both = x.reshape(*own, 2, lanes, length)
+        axes = x.shape[:-1]
+        both = x.reshape(*axes, 2, lanes, length)
         both = jnp.stack([both[..., 0, :, :], both[..., 1, :, ::-1]])
         # (direction, own..., lane, frequency) to (frequency, direction, own..., lane).
-        return jnp.moveaxis(both, -1, 0).reshape(length, 2, *own, *shape)
+        return jnp.moveaxis(both, -1, 0).reshape(length, 2, *axes, *shape)
 
     return {name: arrange(value) for name, value in results.items()}
 
@@ -231,15 +234,15 @@ def branch(
     frequency at least one way), all its orbits were found, and it has no more orbits, folds or doublings than the results.
     """
     low, high = float(omega[0]), float(omega[-1])
-    own = {name: jnp.tile(v, 2) for name, v in vars(model).items() if name != "omega" and jnp.ndim(v)}
-    both = replace(model, omega=1.0, **own)
+    values = {name: jnp.tile(v, 2) for name, v in vars(model).items() if name != "omega" and jnp.ndim(v)}
+    both = replace(model, omega=1.0, **values)
     twice = jnp.tile(first, (1, 2))
     way = jnp.repeat(jnp.array([1.0, -1.0]), first.shape[1])
     limits = (low * (1 - 1e-9), high * (1 + 1e-9))
     scale = _scale(both, twice, limits[1])
     mapped = _period_map(both)
-    found = follow(mapped, twice, scale, direction=way, attempts=_ATTEMPTS, longest=_LONGEST, limits=limits)
-    along = course(found.x, scale)
+    path = follow(mapped, twice, scale, direction=way, attempts=_ATTEMPTS, longest=_LONGEST, limits=limits)
+    along = course(path.x, scale)
     guess, exists, every = jax.lax.map(lambda w: sections(along, w, BRANCHES), jnp.asarray(omega))
     lanes = first.shape[1]
     number = np.broadcast_to(np.arange(omega.size)[:, None, None] * lanes, exists.shape)
@@ -250,12 +253,12 @@ def branch(
     exists = exists.reshape(omega.size, 2 * BRANCHES, lanes)
     results, all_told = _ordered({name: x.reshape(exists.shape) for name, x in results.items()}, exists)
     complete = all_told & every.reshape(-1, 2, lanes).all(axis=1)
-    ended = jnp.any((found.x[:, 2] > limits[1]) | (found.x[:, 2] < limits[0]), axis=0)
+    ended = jnp.any((path.x[:, 2] > limits[1]) | (path.x[:, 2] < limits[0]), axis=0)
     complete &= ended.reshape(2, lanes).all(axis=0)
-    complete &= (found.x[:, 2] >= high).any(axis=0).reshape(2, lanes).any(axis=0)
+    complete &= (path.x[:, 2] >= high).any(axis=0).reshape(2, lanes).any(axis=0)
     if special:
         every_map = lambda index: _period_map(take(both, index))  # noqa: E731
-        frequencies, all_found = folds_and_doublings(every_map, found, (low, high), SPECIAL, SPECIAL, 2)
+        frequencies, all_found = folds_and_doublings(every_map, path, (low, high), SPECIAL, SPECIAL, 2)
         for name, x in zip(("fold_frequency", "doubling_frequency"), frequencies, strict=True):
             results[name] = jnp.broadcast_to(x, (omega.size, *x.shape))
         complete &= all_found
@@ -312,11 +315,11 @@ def _corrected(model: PiecewiseLinearOscillator, states: Array, exists: Array) -
 
 def _described(model: PiecewiseLinearOscillator, states: Array, exists: Array, width: int) -> dict[str, Array]:
     """Extremes and stability of the orbits near ``states`` (2, K)."""
-    found = _corrected(model, states, exists)
+    orbits = _corrected(model, states, exists)
     one = jnp.ones(exists.shape, jnp.int32)
-    seen = measure(model, found[0], found[1], one, width=min(width, exists.size), integrals=False)
-    there = jnp.isfinite(found[0]) & (seen.complete == 1)
-    matrix = tuple(found[2:])
+    seen = measure(model, orbits[0], orbits[1], one, width=min(width, exists.size), integrals=False)
+    there = jnp.isfinite(orbits[0]) & (seen.complete == 1)
+    matrix = tuple(orbits[2:])
     rho = spectral_radius(matrix, log_determinant(model, matrix, model.period))
     stability = jnp.where(rho > 1 + _MARGIN, UNSTABLE, STABLE)
     return {

@@ -208,10 +208,10 @@ def is_short_enough(steps: Any, strobes: Any, following: int, request: Request) 
 
     The limit grows with given ``steps``, because the user asked for them.
     """
-    given, longest = request.options["steps"], request.options["max_time"]
-    most = MOST_WORK * max(1.0, longest) * max(1.0, (given or LEAST) / LEAST)
+    steps_asked, longest = request.options["steps"], request.options["max_time"]
+    most = MOST_WORK * max(1.0, longest) * max(1.0, (steps_asked or LEAST) / LEAST)
     within = (steps * strobes <= MOST_STEPS) & (steps * (strobes + SEGMENTS + following) <= most)
-    return within if given else within & (steps <= MOST)
+    return within if steps_asked else within & (steps <= MOST)
 
 
 def by_groups(
@@ -225,27 +225,27 @@ def by_groups(
 
     The outcome is ``NOT_FINITE`` without a start.
     """
-    given = request.options["steps"]
-    needed = jnp.full(batch_shape(flow), float(given)) if given else needed_steps(flow)
+    steps_asked = request.options["steps"]
+    needed = jnp.full(batch_shape(flow), float(steps_asked)) if steps_asked else needed_steps(flow)
     started = starts(flow)
     able = started & is_short_enough(needed, request.options["max_time"] / jnp.asarray(flow.period), following, request)
 
     def empty() -> dict[str, Array]:
-        shapes = jax.eval_shape(lambda: march(given or jnp.int64(LEAST), able))
-        found = {name: jnp.full(x.shape, blank.get(name, jnp.nan), x.dtype) for name, x in shapes.items()}
-        return found | {"outcome": jnp.where(started, found["outcome"], jnp.int8(Outcome.NOT_FINITE))}
+        shapes = jax.eval_shape(lambda: march(steps_asked or jnp.int64(LEAST), able))
+        blanks = {name: jnp.full(x.shape, blank.get(name, jnp.nan), x.dtype) for name, x in shapes.items()}
+        return blanks | {"outcome": jnp.where(started, blanks["outcome"], jnp.int8(Outcome.NOT_FINITE))}
 
-    def group(found: dict[str, Array], limits: tuple[Any, Any]) -> tuple[dict[str, Array], None]:
+    def group(results: dict[str, Array], limits: tuple[Any, Any]) -> tuple[dict[str, Array], None]:
         members = able & (needed > limits[0]) & (needed <= limits[1])
-        steps = given or jnp.max(jnp.where(members, needed, LEAST)).astype(jnp.int64)
+        steps = steps_asked or jnp.max(jnp.where(members, needed, LEAST)).astype(jnp.int64)
 
         def merged() -> dict[str, Array]:
             new = march(steps, members)
-            return {name: jnp.where(members, new[name], x) for name, x in found.items()}
+            return {name: jnp.where(members, new[name], x) for name, x in results.items()}
 
-        return jax.lax.cond(jnp.any(members), merged, lambda: found), None
+        return jax.lax.cond(jnp.any(members), merged, lambda: results), None
 
-    if given or flow.fastest is None:
+    if steps_asked or flow.fastest is None:
         return group(empty(), (0.0, jnp.inf))[0]
     limits = jnp.array([0.0, *_GROUPS[:-1]]), jnp.array(_GROUPS, float)
     return jax.lax.scan(group, empty(), limits)[0]
@@ -348,9 +348,9 @@ def run_twice(flow: Flow, steps: Any, max_time: float, target: float, members: A
 
     def one(active: Array, steps: Array) -> tuple[Array, Record]:
         record = record_growth(flow, steps, max_time, target, active, to_the_end=to_the_end)
-        found = spectrum_of(record)
+        spectrum = spectrum_of(record)
         return active & record.bounded & ~record.orbit.found & (
-            found.values[0] > STANDARD_ERRORS * found.errors[0]
+            spectrum.values[0] > STANDARD_ERRORS * spectrum.errors[0]
         ), record
 
     _, both = jax.lax.scan(one, members, jnp.stack([jnp.asarray(steps), jnp.maximum(steps // 2, 1)]))
@@ -408,17 +408,17 @@ def _march(flow: Flow, request: Request, steps: Any, members: Array) -> dict[str
         finite = jnp.all(jnp.isfinite(results["paper_estimator"]), axis=0)
         return results | {"outcome": jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE).astype(jnp.int8)}
     run = run_twice(flow, steps, max_time, target, members, "lyapunov_history" in wanted)
-    found = findings_of(run, flow.period)
-    results |= _of_spectrum(run.fine, found)
+    findings = findings_of(run, flow.period)
+    results |= _of_spectrum(run.fine, findings)
     if wanted & _SECTION:
-        results |= _of_section(flow, steps, run.fine, found, members & ("chaos_k01" in wanted))
-    results["outcome"] = _outcome(run.fine, found, target)
+        results |= _of_section(flow, steps, run.fine, findings, members & ("chaos_k01" in wanted))
+    results["outcome"] = _outcome(run.fine, findings, target)
     return {name: results[name] for name in (*request.outputs, "outcome")}
 
 
-def _of_section(flow: Flow, steps: Any, fine: Record, found: Findings, wanted: Array) -> dict[str, Array]:
+def _of_section(flow: Flow, steps: Any, fine: Record, findings: Findings, wanted: Array) -> dict[str, Array]:
     """Verdict, K and period; K of motions without an orbit, if the verdict needs it or it is ``wanted``."""
-    spectrum, coarse, orbit, period = found.spectrum, found.coarse, fine.orbit, common_period(flow, fine.state)
+    spectrum, coarse, orbit, period = findings.spectrum, findings.coarse, fine.orbit, common_period(flow, fine.state)
     decays = spectrum.values[0] < -STANDARD_ERRORS * spectrum.errors[0] - zero_floor(spectrum.values)
     needed = wanted | ~decays if flow.turns else jnp.ones_like(decays)
     seen = sample(flow, steps, fine, needed & ~orbit.found)
@@ -427,8 +427,8 @@ def _of_section(flow: Flow, steps: Any, fine: Record, found: Findings, wanted: A
     # A rest is an orbit of any period, also of clocks that have none in common.
     multiple = jnp.where((period == 0) & decays & following & resting, 1, orbit.multiple)
     evidence = Evidence(
-        spectrum.values, spectrum.errors, coarse.values[0], coarse.errors[0], jnp.abs(found.residual), seen.k01,
-        fine.bounded, following, multiple, (period == 0) & ~resting, seen.returns, found.resolved,
+        spectrum.values, spectrum.errors, coarse.values[0], coarse.errors[0], jnp.abs(findings.residual), seen.k01,
+        fine.bounded, following, multiple, (period == 0) & ~resting, seen.returns, findings.resolved,
         may_be_chaotic(flow, fine.state),
     )  # fmt: skip
     return {
@@ -439,23 +439,23 @@ def _of_section(flow: Flow, steps: Any, fine: Record, found: Findings, wanted: A
     }
 
 
-def _outcome(fine: Record, found: Findings, target: float) -> Array:
+def _outcome(fine: Record, findings: Findings, target: float) -> Array:
     """The outcome of every member, int8."""
-    values, errors = found.spectrum.values, found.spectrum.errors
-    met = found.resolved & ((target == 0) | ~fine.bounded | (jnp.max(errors, axis=0) <= target))
+    values, errors = findings.spectrum.values, findings.spectrum.errors
+    met = findings.resolved & ((target == 0) | ~fine.bounded | (jnp.max(errors, axis=0) <= target))
     outcome = jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
     return jnp.where(jnp.all(jnp.isfinite(values), axis=0), outcome, Outcome.NOT_FINITE).astype(jnp.int8)
 
 
-def _of_spectrum(fine: Record, found: Findings) -> dict[str, Array]:
+def _of_spectrum(fine: Record, findings: Findings) -> dict[str, Array]:
     """Results that follow from the records of growth."""
-    spectrum = found.spectrum
+    spectrum = findings.spectrum
     history = running_mean(fine.growth, fine.used, fine.span)
     return {
         "lyapunov_spectrum": spectrum.values,
         "lyapunov_standard_error": spectrum.errors,
         "lyapunov_history": jnp.take_along_axis(history, spectrum.order[None], axis=1),
-        "sum_rule_residual": found.residual,
+        "sum_rule_residual": findings.residual,
     }
 
 

@@ -232,8 +232,8 @@ def _segment(flow: Flow, steps: Any, parts: Array, length: Array) -> Callable[[_
         carry = (
             jnp.int64(0), frame, march.strobe, march.alive, march.bounded, no_growth, (no_growth, nothing), nothing,
         )  # fmt: skip
-        found = jax.lax.while_loop(lambda c: c[0] < longest, strobe, carry)
-        _, frame, number, alive, bounded, growth, moments, size = found
+        end = jax.lax.while_loop(lambda c: c[0] < longest, strobe, carry)
+        _, frame, number, alive, bounded, growth, moments, size = end
         at = march.segment
         return _March(
             frame, number, alive, bounded, at + 1, march.growth.at[at].set(growth),
@@ -267,8 +267,8 @@ def _orbit_of(flow: Flow, steps: Any, march: _March, span: Array, reached: Array
     wanted = march.alive & ~march.orbit.found & sound & (~diverging | resting)
     last = reached | (march.segment == SEGMENTS)
     period = common_period(flow, march.frame.state)
-    found = find_orbit(flow, steps, march.frame.state, march.strobe, period, wanted, wanted & last)
-    return jax.tree.map(lambda new, old: jnp.where(found.found, new, old), found, march.orbit)
+    orbit = find_orbit(flow, steps, march.frame.state, march.strobe, period, wanted, wanted & last)
+    return jax.tree.map(lambda new, old: jnp.where(orbit.found, new, old), orbit, march.orbit)
 
 
 def block_size(used: Array) -> Array:

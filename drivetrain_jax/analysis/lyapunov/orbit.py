@@ -175,8 +175,8 @@ def find_orbit(
                 again & jnp.any(missing), lambda: _return(flow, steps, state, strobe, period), lambda: period
             )
             missing &= ~again | (multiple != period)
-        found = _newton(flow, steps, state, strobe, jnp.where(missing, multiple, 0))
-        return jax.tree.map(lambda new, old: jnp.where(found.found, new, old), found, known), None
+        orbit = _newton(flow, steps, state, strobe, jnp.where(missing, multiple, 0))
+        return jax.tree.map(lambda new, old: jnp.where(orbit.found, new, old), orbit, known), None
 
     return jax.lax.scan(search, no_orbit(flow), jnp.array([False, True] if flow.turns else [False]))[0]
 
@@ -235,9 +235,9 @@ def _newton(flow: Flow, steps: Any, state: Vector, strobe: Array, multiple: Arra
         jnp.zeros(shape, bool), start, jnp.zeros(shape, bool), nothing, unknown, unknown,
     ))  # fmt: skip
     decays = s.belongs & (s.exponents[0] < -s.errors[0])
-    found = jnp.all(jnp.isfinite(s.errors), axis=0) & (decays | jnp.all(s.state == start, axis=0))
+    converged = jnp.all(jnp.isfinite(s.errors), axis=0) & (decays | jnp.all(s.state == start, axis=0))
     back = jnp.where((s.turn.back > 0) & (multiple % jnp.maximum(s.turn.back, 1) == 0), s.turn.back, multiple)
-    return Orbit(found, jnp.where(found, back, 0), s.exponents, s.errors, s.turn.contraction / period)
+    return Orbit(converged, jnp.where(converged, back, 0), s.exponents, s.errors, s.turn.contraction / period)
 
 
 def _belongs(flow: Flow, states: tuple[Array, Array, Array], matrix: Array, growth: Array) -> Array:

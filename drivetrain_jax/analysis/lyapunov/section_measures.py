@@ -112,9 +112,9 @@ def period_multiple(section: Array, tolerance: Array, longest: int) -> Array:
         earlier = jax.lax.dynamic_slice_in_dim(section, start, _WINDOW) / scale
         return jnp.max(jnp.abs(end - earlier), axis=(0, 1))
 
-    def earliest(found: Array, p: Array) -> tuple[Array, None]:
+    def earliest(multiple: Array, p: Array) -> tuple[Array, None]:
         close = distance(p) <= tolerance
-        return jnp.where((found == 0) & close, p, found), None
+        return jnp.where((multiple == 0) & close, p, multiple), None
 
     none = jnp.zeros(jnp.broadcast_shapes(jnp.shape(tolerance), section.shape[2:]), jnp.int64)
     return jax.lax.scan(earliest, none, jnp.arange(1, longest + 1))[0]

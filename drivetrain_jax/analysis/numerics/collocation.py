@@ -113,17 +113,17 @@ class Factors(NamedTuple):
 def factors(scheme: Scheme, coefficients: Sequence[Array]) -> Factors:
     """The elimination of one panel from ``E_t`` ``(s, d, d, lanes)``, row by row of L and U, without storing M."""
     s, d = coefficients[0].shape[:2]
-    found = Factors([], [], [], [])
+    computed = Factors([], [], [], [])
     for k in range(s * d):
         step = _Step(scheme, s, d, k)
-        lower = stored(step.lower)(coefficients, found.lower, found.upper)
+        lower = stored(step.lower)(coefficients, computed.lower, computed.upper)
         inverse = stored(_inverse)(lower)
-        found.right.append(stored(step.right)(coefficients, found.lower, found.right, inverse))
-        found.left.append(stored(step.left)(found.left, found.upper) if k else step.left([], []))
+        computed.right.append(stored(step.right)(coefficients, computed.lower, computed.right, inverse))
+        computed.left.append(stored(step.left)(computed.left, computed.upper) if k else step.left([], []))
         if k + 1 < s * d:
-            found.upper.append(stored(step.upper)(coefficients, found.lower, found.upper, inverse))
-        found.lower.append(lower)
-    return found
+            computed.upper.append(stored(step.upper)(coefficients, computed.lower, computed.upper, inverse))
+        computed.lower.append(lower)
+    return computed
 
 
 def _inverse(lower: Array) -> Array:
@@ -176,7 +176,7 @@ class _Step(NamedTuple):
         return x
 
 
-def panel_propagator(scheme: Scheme, found: Factors, d: int) -> Array:
+def panel_propagator(scheme: Scheme, elimination: Factors, d: int) -> Array:
     """P of one panel, ``(n, n, lanes)``."""
 
     def total(left: list[Array], right: list[Array]) -> Array:
@@ -185,7 +185,7 @@ def panel_propagator(scheme: Scheme, found: Factors, d: int) -> Array:
             x = x - column[:, None] * row
         return x
 
-    return stored(total)(found.left, found.right)
+    return stored(total)(elimination.left, elimination.right)
 
 
 def panel(scheme: Scheme, coefficients: Sequence[Array]) -> Array:
@@ -196,11 +196,11 @@ def panel(scheme: Scheme, coefficients: Sequence[Array]) -> Array:
         return forward(coefficients)[0]
 
     def forward(coefficients: tuple[Array, ...]) -> tuple[Array, Factors]:
-        found = factors(scheme, coefficients)
-        return panel_propagator(scheme, found, coefficients[0].shape[1]), found
+        elimination = factors(scheme, coefficients)
+        return panel_propagator(scheme, elimination, coefficients[0].shape[1]), elimination
 
-    def backward(found: Factors, weights: Array) -> tuple[tuple[Array, ...]]:
-        slopes = zip(_by_coefficients(scheme, found, weights), coefficients, strict=True)
+    def backward(elimination: Factors, weights: Array) -> tuple[tuple[Array, ...]]:
+        slopes = zip(_by_coefficients(scheme, elimination, weights), coefficients, strict=True)
         # Coefficients that all lanes share.
         return (tuple(jnp.sum(x, -1, keepdims=True) if e.shape[-1] == 1 else x for x, e in slopes),)
 
@@ -208,16 +208,16 @@ def panel(scheme: Scheme, coefficients: Sequence[Array]) -> Array:
     return propagator(tuple(coefficients))
 
 
-def _by_coefficients(scheme: Scheme, found: Factors, weights: Array) -> Iterator[Array]:
+def _by_coefficients(scheme: Scheme, elimination: Factors, weights: Array) -> Iterator[Array]:
     """The gradient of ``sum(weights * P)`` by every ``E_t``."""
-    s, count = len(scheme.nodes), len(found.lower)
+    s, count = len(scheme.nodes), len(elimination.lower)
     d, n = count // s, len(weights)
     unknowns, multipliers = [jnp.zeros(())] * count, [jnp.zeros(())] * count
     for k in reversed(range(count)):
         later = range(k + 1, count)
-        unknowns[k] = found.right[k] - sum(found.upper[k][i - k - 1] * unknowns[i] for i in later)
-        column = found.lower[k]
-        multipliers[k] = (-found.left[k] - sum(column[i - k] * multipliers[i] for i in later)) / column[0]
+        unknowns[k] = elimination.right[k] - sum(elimination.upper[k][i - k - 1] * unknowns[i] for i in later)
+        column = elimination.lower[k]
+        multipliers[k] = (-elimination.left[k] - sum(column[i - k] * multipliers[i] for i in later)) / column[0]
     x = jnp.stack(unknowns).reshape(s, d, n, -1)
     adjoint = jnp.stack([sum(y[r] * weights[r] for r in range(n)) for y in multipliers]).reshape(s, d, n, -1)
     for t, inner in enumerate(scheme.inner):
@@ -259,8 +259,8 @@ def propagators_along(system: LinearPeriodic, lanes: int, parts: Array, x: Array
         b = (in_one_kernel(matrix) if suits_one_kernel(matrix, t) else matrix)(t)
 
         def following(before: Array, _: None) -> tuple[Array, Array]:
-            found = (length * weights @ _product(b, before).reshape(NODES, -1)).reshape(b.shape)
-            return found, found[-1]
+            term = (length * weights @ _product(b, before).reshape(NODES, -1)).reshape(b.shape)
+            return term, term[-1]
 
         unit = jnp.broadcast_to(jnp.eye(size)[..., None], b.shape)
         terms = jnp.concatenate([unit[-1:], jax.lax.scan(following, unit, length=TERMS)[1]])

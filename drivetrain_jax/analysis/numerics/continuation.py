@@ -86,15 +86,15 @@ def _on_plane(period_map: PeriodMap, guess: Array, normal: Array, scale: Array, 
 
     def correct(state: tuple[Array, _Solved]) -> tuple[Array, _Solved]:
         count, old = state
-        found = period_map(old.x)
+        image = period_map(old.x)
         ahead = jnp.sum(normal * (guess - old.x) / scale, axis=0)
-        right = jnp.concatenate([(old.x[:-1] - found.end) / scale[:-1], ahead[None]])
-        system = _bordered(found.matrix, found.slope, normal, scale)
+        right = jnp.concatenate([(old.x[:-1] - image.end) / scale[:-1], ahead[None]])
+        system = _bordered(image.matrix, image.slope, normal, scale)
         step, along = jnp.moveaxis(solve(system, jnp.stack([right, last], axis=1)), 1, 0)
         tangent = along / jnp.sqrt(jnp.sum(along**2, axis=0))
         change = jnp.max(jnp.abs(step), axis=0)
         open_ = old.change > converged
-        new = _Solved(old.x + step * scale, found.matrix, tangent, old.corrections + 1, change, old.steps + found.steps)
+        new = _Solved(old.x + step * scale, image.matrix, tangent, old.corrections + 1, change, old.steps + image.steps)
         return count + 1, jax.tree.map(lambda a, b: jnp.where(open_, a, b), new, old)
 
     zero = jnp.zeros(lanes)
@@ -254,39 +254,44 @@ def locate(period_map: PeriodMap, ends: tuple[Array, Array], tests: tuple[Array,
 
 
 def folds_and_doublings(
-    map_of: Callable[[Array], PeriodMap], found: Branch, limits: tuple[float, float], each: int, most: int, parts: int
+    map_of: Callable[[Array], PeriodMap],
+    branch: Branch,
+    limits: tuple[float, float],
+    per_part: int,
+    most: int,
+    parts: int,
 ) -> tuple[Array, Array]:
     """Parameters of folds and period doublings within the limits, ``(2, most, N)``: of each the largest ones, rising, NaN
     after the last one.
 
-    ``found`` has ``parts N`` lanes, the parts of every line N apart, and up to ``each`` of both kinds on a part. What
+    ``branch`` has ``parts N`` lanes, the parts of every line N apart, and up to ``per_part`` of both kinds on a part. What
     several parts have in common counts once.
     ``map_of(index)`` is the period map of the lanes ``index``. The second result, ``(N,)``, is true if all were located, and
     there are no others.
     """
-    tests = _tests(found.matrix)  # pyright: ignore[reportArgumentType]
+    tests = _tests(branch.matrix)  # pyright: ignore[reportArgumentType]
     changes = (tests[:, 1:] * tests[:, :-1] < 0).transpose(1, 0, 2)
     lanes = changes.shape[2]
 
     # One more than are located, to detect further ones.
-    above = jnp.maximum(found.x[1:, -1], found.x[:-1, -1])[:, None]
+    above = jnp.maximum(branch.x[1:, -1], branch.x[:-1, -1])[:, None]
     above = jnp.where(changes, above, -jnp.inf)
-    place = jnp.argsort(-above, axis=0)[: each + 1]
+    place = jnp.argsort(-above, axis=0)[: per_part + 1]
     exists = jnp.take_along_axis(changes, place, axis=0)
     column = jnp.broadcast_to(jnp.arange(lanes), place.shape)
     kind = jnp.broadcast_to(jnp.arange(2)[:, None], place.shape)
 
     def at(shift: int) -> tuple[Array, Array]:
-        x = jnp.where(exists[:, :, None], jnp.moveaxis(found.x[place + shift, :, column], -1, 2), jnp.nan)
+        x = jnp.where(exists[:, :, None], jnp.moveaxis(branch.x[place + shift, :, column], -1, 2), jnp.nan)
         value = jnp.where(exists, tests[kind, place + shift, column], jnp.nan)
-        return jnp.moveaxis(x, 2, 0).reshape(found.x.shape[1], -1), value.reshape(-1)
+        return jnp.moveaxis(x, 2, 0).reshape(branch.x.shape[1], -1), value.reshape(-1)
 
     (before, first), (after, second) = at(0), at(1)
     x = locate(map_of(column.reshape(-1)), (before, after), (first, second), kind.reshape(-1) == 1)
     p = x[-1].reshape(place.shape)
     lost = jnp.any(exists & jnp.isnan(p), axis=(0, 1)).reshape(parts, -1).any(axis=0)
     p = jnp.where((p >= limits[0]) & (p <= limits[1]), p, -jnp.inf)
-    more = jnp.any(jnp.isfinite(p[each]), axis=0).reshape(parts, -1).any(axis=0)
+    more = jnp.any(jnp.isfinite(p[per_part]), axis=0).reshape(parts, -1).any(axis=0)
     # Join the parts of a line, select the largest parameters, then sort them.
     p = jnp.moveaxis(p.reshape(-1, 2, parts, lanes // parts), 2, 0).reshape(-1, 2, lanes // parts)
     falling = -jnp.sort(-p, axis=0)
@@ -397,8 +402,8 @@ def sections(branch: Course, omega: Array, count: int) -> tuple[Array, Array, Ar
         return jnp.where(here == start, middle, low), jnp.where(here == start, high, middle)
 
     low, high = jax.lax.fori_loop(0, _SECTION_HALVINGS, halve, (low, high))
-    found = _cubic(ends, slopes, ((low + high) / 2)[:, None])  # pyright: ignore[reportArgumentType]
-    return jnp.where(exists[:, None], found, 0.0), exists, every
+    places = _cubic(ends, slopes, ((low + high) / 2)[:, None])  # pyright: ignore[reportArgumentType]
+    return jnp.where(exists[:, None], places, 0.0), exists, every
 
 
 def distinct(high: Array, low: Array) -> Array:

@@ -186,7 +186,7 @@ Words = tuple[tuple[str, str], ...]
 Columns = Mapping[str, Any]
 
 
-def predicted(function: Callable[..., Array], given: tuple[Hashable, ...], columns: Columns) -> np.ndarray:
+def predicted(function: Callable[..., Array], constants: tuple[Hashable, ...], columns: Columns) -> np.ndarray:
     """``function(*given, values)`` of every point, shape ``(..., N)``.
 
     ``columns`` are the values of N points: numbers as arrays of shape ``(N,)`` or one number for all points, words, and
@@ -196,14 +196,14 @@ def predicted(function: Callable[..., Array], given: tuple[Hashable, ...], colum
     words, numbers = split(columns)
     count = count_of(columns)
     together = _FEW if count <= _FEW else _MANY
-    call = _compiled(function, given, words, together)
-    found = []
+    call = _compiled(function, constants, words, together)
+    blocks = []
     for start in range(0, count, together):
         size = min(together, count - start)
         # The last block is padded with its last point.
         places = np.minimum(np.arange(start, start + together), count - 1)
-        found.append(_called(call, taken(numbers, places))[..., :size])
-    return np.concatenate(found, axis=-1)
+        blocks.append(_called(call, taken(numbers, places))[..., :size])
+    return np.concatenate(blocks, axis=-1)
 
 
 def count_of(columns: Columns) -> int:
@@ -237,10 +237,10 @@ def _called(call: Callable[[Columns], Array], block: Columns) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def _compiled(
-    function: Callable[..., Array], given: tuple[Hashable, ...], words: Words, count: int
+    function: Callable[..., Array], constants: tuple[Hashable, ...], words: Words, count: int
 ) -> Callable[[Columns], Array]:
     def one(numbers: Columns) -> Array:
-        return function(*given, {**dict(words), **numbers})
+        return function(*constants, {**dict(words), **numbers})
 
     options = options_for_few() if count == _FEW else {}
     return jax.jit(jax.vmap(one, 0, -1, axis_size=count), compiler_options=options)

@@ -65,10 +65,10 @@ def in_blocks(
         return mark(lambda values: function(values, lanes))(values)
 
     def part(columns: list[Array]) -> Any:
-        own = list(leaves)
+        block = list(leaves)
         for i, column in zip(varying, columns, strict=True):
-            own[i] = column
-        return function(jax.tree.unflatten(tree, own), size)
+            block[i] = column
+        return function(jax.tree.unflatten(tree, block), size)
 
     cut = [blocks_first(jnp.asarray(leaves[i]), size) for i in varying]
     return jax.tree.map(lambda x: blocks_joined(x, lanes), mark(lambda columns: lax.map(part, columns))(cut))
@@ -158,11 +158,11 @@ def lanes_last(
 def _empty(call: Callable[[Any, Any], Any], batched: Any, varying: Any, shared: Any) -> tuple[Any, Any]:
     """The results of no points, for the rule of ``jax.vmap``."""
 
-    def one(x: Array, own: bool) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct(x.shape[own:], x.dtype)
+    def one(x: Array, batched: bool) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(x.shape[batched:], x.dtype)
 
     results = jax.eval_shape(
-        call, *(jax.tree.map(one, x, own) for x, own in zip((varying, shared), batched, strict=True))
+        call, *(jax.tree.map(one, x, flags) for x, flags in zip((varying, shared), batched, strict=True))
     )
     return jax.tree.map(lambda x: jnp.zeros((0, *x.shape), x.dtype), results), jax.tree.map(lambda _: True, results)
 
@@ -172,28 +172,28 @@ def _at_once(
 ) -> Any:
     """The results of all lanes, ``size`` of them at a time if given."""
     lanes = max(x.shape[-1] for x in jax.tree.leaves(varying))
-    given = jax.tree.map(lambda x: x[0] if x.shape == (1,) and lanes > 1 else x, varying), shared
+    arrays = jax.tree.map(lambda x: x[0] if x.shape == (1,) and lanes > 1 else x, varying), shared
     if size is None or not on_cpu():
-        return function(constants, *given)
+        return function(constants, *arrays)
     full = max(lanes, size)
-    given = jax.tree.map(lambda x: _padded(x, full) if x.ndim and x.shape[-1] == lanes else x, given)
-    results = in_blocks(lambda own, _: traced_once(function, constants, *own), given, full, size)
+    arrays = jax.tree.map(lambda x: _padded(x, full) if x.ndim and x.shape[-1] == lanes else x, arrays)
+    results = in_blocks(lambda block, _: traced_once(function, constants, *block), arrays, full, size)
     return jax.tree.map(lambda x: x[..., :lanes], results)
 
 
-def _merged(batch: int, lanes: int, x: Array, own: bool) -> Array:
-    """A varying array with the batch merged into the lanes; the batch is its first axis if it has its ``own`` values."""
-    if own:
+def _merged(batch: int, lanes: int, x: Array, batched: bool) -> Array:
+    """A varying array with the batch merged into the lanes; the batch is its first axis if it has its ``batched`` values."""
+    if batched:
         x = jnp.broadcast_to(x, (*x.shape[:-1], lanes))
         return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], batch * lanes)
     return x if x.shape[-1] == 1 else jnp.tile(x, batch)
 
 
-def _common(batch: int, lanes: int, x: Array, own: bool) -> Array:
+def _common(batch: int, lanes: int, x: Array, batched: bool) -> Array:
     """A shared value for the whole batch: the maximum of different integers, or an array of lanes of other values."""
-    if own and jnp.issubdtype(x.dtype, jnp.integer):
+    if batched and jnp.issubdtype(x.dtype, jnp.integer):
         return jnp.max(x)
-    if own:
+    if batched:
         return jnp.broadcast_to(x if x.ndim > 1 else x[:, None], (batch, lanes)).reshape(-1)
     return x if jnp.ndim(x) == 0 else jnp.tile(x, batch)
 
@@ -227,7 +227,7 @@ def over_lanes(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]
         arrays, rest = eqx.partition(dict(values), lambda x: isinstance(x, jax.Array) and x.ndim > 0)
         if not jax.tree.leaves(arrays):
             return function(values, effort)
-        return jax.vmap(lambda own: function(eqx.combine(own, rest), effort), 0, -1)(arrays)
+        return jax.vmap(lambda point: function(eqx.combine(point, rest), effort), 0, -1)(arrays)
 
     return all_lanes
 

@@ -204,9 +204,9 @@ def eigenvalues(a: Array) -> tuple[Array, Array]:
     n = a.shape[0]
     if n > 2:
         h = _deflated(h)
-    found = [_entry(h, i, i) for i in range(min(n, 2), n)]
-    found += _pair(*(_entry(h, i, j) for i in (0, 1) for j in (0, 1))) if n > 1 else [_entry(h, 0, 0)]
-    return jnp.stack([x for x, _ in found]), jnp.stack([y for _, y in found])
+    pairs = [_entry(h, i, i) for i in range(min(n, 2), n)]
+    pairs += _pair(*(_entry(h, i, j) for i in (0, 1) for j in (0, 1))) if n > 1 else [_entry(h, 0, 0)]
+    return jnp.stack([x for x, _ in pairs]), jnp.stack([y for _, y in pairs])
 
 
 def _deflated(h: Complex) -> Complex:

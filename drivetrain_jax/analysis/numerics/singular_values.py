@@ -49,8 +49,8 @@ def singular_values(*blocks: Array) -> tuple[Array, Array]:
     of the order of the rounding unit times the largest singular value. A lane with an entry that is not finite returns NaN
     and does not delay the others.
     """
-    values, found = bidiagonal_values(bidiagonal_form(*blocks))
-    return jnp.sort(values, axis=0), found
+    values, complete = bidiagonal_values(bidiagonal_form(*blocks))
+    return jnp.sort(values, axis=0), complete
 
 
 def bidiagonal_form(*blocks: Array) -> Bidiagonal:
@@ -129,14 +129,14 @@ def _bidiagonalise(a: Array) -> tuple[Array, Array]:
 
     ``a`` has shape ``(m, n, N)`` with ``m >= n``; the last entry of the upper diagonal is zero.
     """
-    found = []
+    stages = []
     while a.shape[1]:
         steps = min(_STAGE, a.shape[1])
         zero = jnp.zeros((steps, a.shape[2]), a.dtype)
         a, diagonal, upper = lax.fori_loop(0, steps, _reduce_row_and_column, (a, zero, zero))
-        found.append((diagonal, upper))
+        stages.append((diagonal, upper))
         a = a[steps:, steps:]
-    diagonal, upper = (jnp.concatenate([pair[i] for pair in found]) for i in (0, 1))
+    diagonal, upper = (jnp.concatenate([pair[i] for pair in stages]) for i in (0, 1))
     return diagonal, upper.at[-1].set(0.0)
 
 
@@ -240,10 +240,10 @@ def bidiagonal_values(form: Bidiagonal) -> tuple[Array, Array]:
         return count + 1, *_split(_sweep(pairs, first, last))
 
     _, pairs, _, last = lax.while_loop(unfinished, improve, (jnp.int32(0), pairs, first, last))
-    found = form.finite & (last == 0)
+    complete = form.finite & (last == 0)
     values = jnp.abs(pairs[:n, 1])
     values = jnp.where(values < n * _TINY, 0.0, values) * form.scale
-    return jnp.where(found, values, jnp.nan), found
+    return jnp.where(complete, values, jnp.nan), complete
 
 
 # Right singular vectors of many small matrices at once, without LAPACK: one-sided Jacobi rotations, lanes last.
