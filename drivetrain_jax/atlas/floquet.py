@@ -33,7 +33,7 @@ def solve_rtol(tolerance: float) -> float:
 
 def floquet_domain(system: type[System], ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, Any]) -> Domain:
     """The box ``ranges`` (name to lower and upper value) of ``system`` with the coordinates that the system declares."""
-    smooth = _smooth(system)
+    smooth = smoothness(system)
     names = tuple(ranges)
     return Domain(
         names,
@@ -90,8 +90,10 @@ def stability_atlas(atlas: Atlas, system: type[System], rtol: float) -> Stabilit
     return StabilityAtlas(atlas, system.models["floquet"].build, rtol)
 
 
-def _smooth(system: type[System]) -> Smoothness:
-    return system.models["atlas"].smooth or Smoothness({})
+def smoothness(system: type[System]) -> Smoothness:
+    """What the system declares for its atlas; empty for a system without one."""
+    model = system.models.get("atlas")
+    return (model and model.smooth) or Smoothness({})
 
 
 def middle_of(domain: Domain) -> dict[str, Any]:
@@ -106,7 +108,7 @@ def _form(system: type[System], domain: Domain) -> LinearPeriodic:
 
 def balanced_entries(system: type[System], domain: Domain, points: np.ndarray, entries: np.ndarray) -> np.ndarray:
     """``T A S`` for entries of A ``(N, n n)`` at points in parameters, A itself without a balance."""
-    if (balance := _smooth(system).balance) is None:
+    if (balance := smoothness(system).balance) is None:
         return entries
     values = {**domain.fixed, **dict(zip(domain.parameters, points.T, strict=True))}
     left, right = (scales.reshape(len(scales), -1).T for scales in balance.scales(values, middle_of(domain)))
@@ -149,7 +151,7 @@ def _function(
         return lambda: balanced(domain.points(at), waiting())
 
     return domain, Function(
-        solved, scale, start, partial(_degrees, system, domain, tolerance) if _smooth(system).balance else None
+        solved, scale, start, partial(_degrees, system, domain, tolerance) if smoothness(system).balance else None
     )
 
 
@@ -185,7 +187,7 @@ def polynomials_needed(
     Interpolation at n Chebyshev nodes of a function bounded by M on the ellipse of radius r leaves out at most
     4 M r^(1-n)/(r-1). With several coordinates these errors add up, each times the Lebesgue constants of earlier ones.
     """
-    smooth, d = _smooth(system), len(lower)
+    smooth, d = smoothness(system), len(lower)
     corners = np.array(list(itertools.product(*zip(lower, upper, strict=True)))).T
     fixed = {name: smooth.coordinate(name).forward(value) for name, value in domain.fixed.items()}
     x = {**fixed, **dict(zip(domain.parameters, corners[..., None, None], strict=True))}
@@ -238,7 +240,7 @@ Key = tuple[Callable[..., FloquetModel], Series, tuple[str, ...], Words, tuple[t
 
 def series_nodes(system: type[System], domain: Domain, tolerance: float) -> SeriesNodes | None:
     """The source of nodes for ``domain``; None without a series of the system, or if the parts would be too inaccurate."""
-    series = _smooth(system).series
+    series = smoothness(system).series
     if series is None or series.parameter not in domain.parameters or tolerance < _TOO_FINE:
         return None
     corners = np.array(list(itertools.product(*zip(domain.lower, domain.upper, strict=True))))

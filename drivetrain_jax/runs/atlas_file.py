@@ -17,7 +17,7 @@ from drivetrain_jax.analysis import OUTCOME, Request, get_analysis
 from drivetrain_jax.analysis._base import make_request
 from drivetrain_jax.analysis.atlas import ANALYSIS
 from drivetrain_jax.atlas import StabilityAtlas, from_arrays, proof, stability_atlas, to_arrays
-from drivetrain_jax.atlas.floquet import floquet_domain
+from drivetrain_jax.atlas.floquet import floquet_domain, smoothness
 from drivetrain_jax.runs.assemble import ResultBuffer, labelled, result_attrs, to_dataset
 from drivetrain_jax.runs.axes import Axis
 from drivetrain_jax.runs.job import Job
@@ -353,7 +353,9 @@ class StoredAtlas:
     def proved(self, columns: Mapping[str, Any], verdict: np.ndarray) -> np.ndarray:
         """Flags, in the shape of ``verdict``, of the verdicts that are proved; ``columns`` are broadcast to this shape."""
         given = [np.broadcast_to(np.asarray(columns[name], float), np.shape(verdict)) for name in self.parameters]
-        codes = proof.verdicts(self.stability.atlas, np.stack([column.reshape(-1) for column in given], axis=-1))
+        codes = proof.verdicts(
+            self.stability.atlas, self.scene.system, np.stack([column.reshape(-1) for column in given], axis=-1)
+        )
         codes = codes.reshape(np.shape(verdict))
         return (codes != proof.UNDECIDED) & (codes == verdict)
 
@@ -425,9 +427,7 @@ def verify_proof(path: Path) -> tuple[str, str]:
     atlas, system = stored.stability.atlas, stored.scene.system
     proved = [panel for panel in atlas.panels if np.isfinite(panel.proved_error)]
     if not proved:
-        reason = (
-            "bounds are proved for the cardan shaft over beta, Omega or both, without strong damping or very low speeds"
-        )
+        reason = proof.with_proofs(atlas, system)[1] or "allowed is to run its scene again"
         return "proof: none in this file", f"holds no proof; {reason}"
     errors = [(proof.proved_error(atlas, panel, system), panel.proved_error) for panel in proved]
     found, claimed = max(errors, key=lambda pair: pair[0] / pair[1])
@@ -435,7 +435,7 @@ def verify_proof(path: Path) -> tuple[str, str]:
     wrong = f"proved_error = {claimed:.2e}: the proof gives {found:.2e}; allowed is to compute the file again"
     columns = [np.linspace(*ends, _CELLS) for ends in stored.ranges.values()]
     points = np.stack([x.reshape(-1) for x in np.meshgrid(*columns, indexing="ij")], axis=-1)
-    codes, given = proof.verdicts(atlas, points), stored.stability.at(points)["verdict"]
+    codes, given = proof.verdicts(atlas, system, points), stored.stability.at(points)["verdict"]
     both = (codes != proof.UNDECIDED) & (given != proof.UNDECIDED)
     agree = int((both & (codes == given)).sum())
     line = f"{lines}; {agree} of {codes.size} verdicts of a chart proved"
@@ -453,7 +453,10 @@ class AtlasRoute(Route):
     def in_memory(self, job: Job, work: Work, progress: Progress) -> Labelled:
         """The atlas; ``progress`` counts the solves."""
         stability, _ = build_atlas(job.scene, atlas_ranges(job.scene), work, progress)
-        stability = replace(stability, atlas=proof.with_proofs(stability.atlas, job.scene.system))
+        atlas, reason = proof.with_proofs(stability.atlas, job.scene.system)
+        stability = replace(stability, atlas=atlas)
+        if reason and smoothness(job.scene.system).enclosure:
+            progress.note = "; ".join(filter(None, (progress.note, f"verdicts are estimates: {reason}")))
         return to_labelled(stability, job.scene).with_attrs(**job.attrs)
 
     def into_file(

@@ -84,17 +84,53 @@ class Balance:
     growth: Callable[[Columns, Columns], np.ndarray]
 
 
+# Half a unit in the last place of a number between 1 and 2.
+UNIT = 2.0**-53
+
+
+def rounding(n: float) -> float:
+    """Bound of the relative error of ``n`` roundings."""
+    return n * UNIT / (1 - n * UNIT)
+
+
+def frobenius(a: np.ndarray) -> np.ndarray:
+    """Frobenius norms of matrices, ``(..., n, n)``."""
+    return np.sqrt((a * a).sum((-1, -2)))
+
+
+@dataclass(frozen=True)
+class Enclosure:
+    """Propagators ``T Phi S`` of four states with proved bounds of their errors, from which an atlas proves its verdicts.
+
+    ``varying`` are the parameters that an atlas with proofs may vary; its grids are cut along the first one, because points
+    along the others share work.
+
+    ``propagators(axes, fixed, middle)`` returns, for the grid of the coordinates ``axes``, the coordinates of its points
+    ``(N, d)``, bounds of their errors, matrices ``(N, 4, 4)``, and bounds ``(N,)`` of the norms of their errors, infinite
+    where there is none. ``coordinate(name, values)`` returns a coordinate and bounds of its errors.
+    ``log_determinant(columns)`` is log det Z with a relative error of at most 24 units in the last place. It is 0 only
+    without damping, and in a box least at a corner.
+    """
+
+    varying: tuple[str, ...]
+    propagators: Callable[[Columns, Columns, Columns], tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]
+    coordinate: Callable[[str, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    log_determinant: Callable[[Columns], np.ndarray]
+
+
 @dataclass(frozen=True)
 class Smoothness:
     """Coordinates by parameter in which the results of a model are smooth; a missing parameter is its own coordinate.
 
     With ``series`` an atlas computes all its nodes along the parameter of the series together. With ``balance`` too, the
-    numbers of its polynomials and the error of leaving out all others are known beforehand.
+    numbers of its polynomials and the error of leaving out all others are known beforehand; with ``enclosure`` as well, its
+    verdicts are proved.
     """
 
     coordinates: Mapping[str, Coordinate]
     series: Series | None = None
     balance: Balance | None = None
+    enclosure: Enclosure | None = None
 
     def coordinate(self, parameter: str) -> Coordinate:
         """The coordinate of ``parameter``."""

@@ -36,8 +36,6 @@ from drivetrain_jax.systems._base import (
 )
 from drivetrain_jax.systems._models import (
     SWAP,
-    Balance,
-    Columns,
     Components,
     Coordinate,
     FloquetModel,
@@ -48,6 +46,7 @@ from drivetrain_jax.systems._models import (
     Series,
     Smoothness,
 )
+from drivetrain_jax.systems.cardan_bounds import BALANCE, ENCLOSURE
 
 # Clock of the reduced equations, and predicted numbers of steps in this clock.
 
@@ -184,55 +183,6 @@ def _inverse_square(x: Any) -> np.ndarray:
     return 1 / np.asarray(x) ** 2
 
 
-def _typical(middle: Columns) -> tuple[float, float]:
-    """sqrt(mu) and 1/sqrt(gamma) of a domain."""
-    return middle["mu"] ** 0.5, middle["gamma"] ** -0.5
-
-
-def _scales(values: Columns, middle: Columns) -> tuple[np.ndarray, np.ndarray]:
-    """T, which depends on the angle alone, and S: near them (T Phi S) is orthogonal without damping."""
-    root_mu, g = _typical(middle)
-    one = np.ones_like(np.asarray(values["beta"], float))
-    t, k, s = max(root_mu, 1.0) ** 0.5 / np.sqrt(np.cos(values["beta"])), (root_mu * g) ** 0.5, (1 + root_mu**2) ** 0.25
-    return np.stack([t, k * one, 1 / t, one / k]), np.stack([one / s, one / k, s * one, k * one])
-
-
-def _growth(x: Columns, middle: Columns) -> np.ndarray:
-    """ln of a bound of |T Phi S| for coordinates x, of which one is complex: eq. (16)."""
-    mu, alpha, zeta = x["mu"], np.abs(x["alpha"]), np.abs(x["zeta"])
-    s, root_mu, g, half = np.abs(x["Omega"]), np.sqrt(np.abs(mu)), np.abs(x["gamma"]), math.pi / 2
-    c, turn = np.exp(-np.real(x["beta"])), np.abs(np.imag(x["beta"]))
-    cosine, tangent = np.cos(turn / 2), np.tan(turn / 2)
-    # |Im w| over the w of |cos(beta)|, and the integrals of |eta'|, of |eta eta'|, and of w eta^2.
-    aside = np.where(turn <= half, np.sin(turn / 2), 1 / (2 * cosine))
-    bend = np.sqrt(1 + c**4 - 2 * c**2 * np.cos(2 * turn)) / (c * cosine**2)
-    steep, square = bend * (1 + c**2) / (2 * c * cosine), half * (1 + c**2) / (2 * c)
-
-    def negative(name: str) -> np.ndarray:
-        return np.maximum(-np.real(x[name]), 0.0)
-
-    rotation = half * (np.maximum(1, root_mu * g) + root_mu) * (np.abs(np.imag(x["Omega"])) / cosine + s * aside)
-    rotation += half * s * root_mu * (np.abs(np.sin(np.angle(mu) / 2)) * (1 + g) + np.abs(np.imag(x["gamma"])))
-    driven = square / cosine**3 + g**2 * half / cosine
-    damped = 2 * (zeta * negative("Omega") + s * negative("zeta")) * (half / cosine + alpha * driven)
-    damped += 2 * zeta * s * (negative("alpha") * driven + alpha * np.imag(x["gamma"]) ** 2 * half)
-    damped += 8 * zeta * alpha * s * tangent * (tangent * square / cosine + aside * (square / cosine + g * half))
-    coupled = zeta * alpha * (steep + g * bend) + root_mu * bend / 2
-    # From the balanced states at the start, and to them at the end.
-    typical_root, typical_g = _typical(middle)
-    t, k, first = (
-        max(typical_root, 1.0) ** 0.5 / np.sqrt(c),
-        (typical_root * typical_g) ** 0.5,
-        (1 + typical_root**2) ** 0.25,
-    )
-    end = t**2 + (k / (g * c)) ** 2 + (k / (root_mu * g)) ** 2 + (1 + zeta**2 * (1 + alpha / c**2) ** 2) / t**2
-    end += (1 + (zeta * alpha * g) ** 2 * (1 / c**2 + 1 / root_mu**2)) / k**2
-    start = (1 + (root_mu * c) ** 2 + zeta**2 * ((1 + alpha * c**2) ** 2 + (2 * alpha * g * c) ** 2)) / first**2
-    start += first**2 + k**2 + ((root_mu * g) ** 2 + (zeta * alpha * g**2) ** 2) / k**2
-    # The path around the poles of eta ends where cos(beta) is negative.
-    return np.where(turn < 3.1, rotation + damped + coupled + np.log(end * start) / 2, np.inf)
-
-
 # Phi is entire in 1/Omega, mu, alpha, zeta, 1/sqrt(gamma) and ln sec(beta). The last holds because the path of integration
 # can avoid the poles of eta, sin(tau)^2 = 1/sin(beta)^2, and because cos(beta) = 0 or infinity is infinitely far away.
 SMOOTH = Smoothness(
@@ -252,7 +202,8 @@ SMOOTH = Smoothness(
         ),
     },
     Series("Omega"),
-    Balance(_scales, _growth),
+    BALANCE,
+    ENCLOSURE,
 )
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from drivetrain_jax.atlas import proof
 from drivetrain_jax.atlas.floquet import middle_of
-from drivetrain_jax.systems import get_system
+from drivetrain_jax.systems import cardan_bounds, get_system
 from tests.oracles.atlas_direct import BASE, CARDAN, cardan_atlas, direct_radius, propagators, random_points
 from tests.oracles.cardan_precise_reference import multipliers
 
@@ -33,8 +33,10 @@ def undamped_chart(undamped):
     return proved(undamped)
 
 
-def values(atlas, points):
-    return {**atlas.atlas.fixed, **dict(zip(atlas.atlas.parameters, points.T, strict=True))}
+def polynomial(atlas, points):
+    """The polynomial of the panel at points, and bounds of the norms of its errors there."""
+    x, wrong = zip(*map(cardan_bounds._coordinate, atlas.atlas.parameters, points.T), strict=True)
+    return proof._evaluated(atlas.atlas.panels[0], np.stack(x, axis=-1), np.stack(wrong, axis=-1))
 
 
 def faces(atlas, count, seed=0):
@@ -46,7 +48,7 @@ def faces(atlas, count, seed=0):
 
 
 def test_nodes_integrate_polynomials():
-    t, q, sums = proof._tables()
+    t, q, sums = cardan_bounds._tables()
     ends = np.append(t, 1.0)
     for n in range(len(t)):
         exact = (ends ** (n + 1) - (-1.0) ** (n + 1)) / (n + 1)
@@ -60,7 +62,7 @@ def test_rates_bound_the_matrix_on_ellipses(seed):
     random = np.random.default_rng(seed)
     given = {name: 10 ** random.uniform(-1, 1) for name in ("alpha", "mu", "gamma")}
     given["zeta"] = random.choice([0.0, 0.01, 1.0])
-    lines = proof._Lines(np.array([1.0, 10 ** random.uniform(-1.5, 0)]), given, 1.0, 6)
+    lines = cardan_bounds._Lines(np.array([1.0, 10 ** random.uniform(-1.5, 0)]), given, 1.0, 6)
     k1, k2 = lines.scales
     balance = np.stack([k1, k2, 1 / k1, 1 / k2], axis=-1)
     for radius in (1.0, 1.3, 2.0, 4.6):
@@ -87,7 +89,7 @@ def test_propagators_lie_within_their_bounds(seed):
         **{n: 10 ** random.uniform(-1, 1) for n in ("alpha", "mu", "gamma")},
     }
     beta, omega = random.uniform(0, 1.45, 5), random.uniform(0.3, 2, 6)
-    phi, error = proof.propagators(np.cos(beta), 1 / omega, given, given)
+    phi, error = cardan_bounds.propagators(np.cos(beta), 1 / omega, given, given)
     columns = dict(zip(("Omega", "beta"), np.meshgrid(omega, beta, indexing="ij"), strict=True))
     exact = propagators({**given, **{n: x.ravel() for n, x in columns.items()}}, 1e-14).reshape(phi.shape)
     root_mu, g = given["mu"] ** 0.5, given["gamma"] ** -0.5
@@ -115,7 +117,7 @@ def test_the_bound_holds_and_would_not_if_it_were_ten_times_smaller(chart):
 def test_coefficients_on_faces_lie_within_the_proved_bound(chart):
     """The coefficients e_k of p, against 60 digits; with an error of at most eps in Phi they are wrong by d_k."""
     points = faces(chart, 4, seed=1)
-    phi, rounded = proof._evaluated(chart.atlas.panels[0], *proof._coordinates(chart.atlas, points))
+    phi, rounded = polynomial(chart, points)
     assert (rounded < 1e-11).all()
     z = proof._SWAP @ np.swapaxes(phi, 1, 2) @ proof._SWAP @ phi
     size, eps = np.linalg.norm(phi, axis=(1, 2)), chart.atlas.panels[0].proved_error + rounded
@@ -139,18 +141,18 @@ def test_verdicts_agree_with_direct_solves(chart):
         stable = (chart.at(middle)["spectral_radius"] < 1)[:, None]
         inside, outside = np.where(stable, middle, inside), np.where(stable, outside, middle)
         points = np.concatenate([points, middle[:10]])
-    found, (radius, _) = proof.verdicts(chart.atlas, points), direct_radius(chart, points)
+    found, (radius, _) = proof.verdicts(chart.atlas, CARDAN, points), direct_radius(chart, points)
     sure = np.abs(radius - 1) > 1e-9
     assert (found[sure & (found != 2)] == (radius[sure & (found != 2)] > 1)).all()
     # At random points nearly nothing is open, at the boundary everything is.
-    assert (found[:2000] == 2).mean() < 2e-3 and (proof.verdicts(chart.atlas, inside) == 2).mean() > 0.9
+    assert (found[:2000] == 2).mean() < 2e-3 and (proof.verdicts(chart.atlas, CARDAN, inside) == 2).mean() > 0.9
 
 
 def test_the_nearest_decided_cells_are_decided_rightly(chart):
     """Against 30 digits: the decided points of a fine grid that are nearest to the boundary."""
     axes = np.linspace(0, 1.2, 150), np.linspace(0.3, 2, 300)
     points = np.stack([x.ravel() for x in np.meshgrid(*axes, indexing="ij")], axis=-1)
-    found, radius = proof.verdicts(chart.atlas, points), chart.at(points)["spectral_radius"]
+    found, radius = proof.verdicts(chart.atlas, CARDAN, points), chart.at(points)["spectral_radius"]
     decided = np.flatnonzero(found != 2)
     nearest = decided[np.argsort(np.abs(radius[decided] - 1))[:6]]
     for point, verdict in zip(points[nearest], found[nearest], strict=True):
@@ -162,19 +164,20 @@ def test_the_nearest_decided_cells_are_decided_rightly(chart):
 def test_verdicts_allow_for_every_error_within_the_bound(chart, size):
     """Phi is changed by exactly the bound: no verdict may differ from the true one."""
     random, points = np.random.default_rng(3), faces(chart, 2000, seed=3)
-    phi, _ = proof._evaluated(chart.atlas.panels[0], *proof._coordinates(chart.atlas, points))
+    phi, _ = polynomial(chart, points)
     change = random.normal(size=phi.shape)
     # Half of the changes have rank one.
     change[::2] = random.normal(size=(len(change[::2]), 4, 1)) * random.normal(size=(len(change[::2]), 1, 4))
     change *= size / np.linalg.norm(change, axis=(1, 2))[:, None, None]
-    found = proof._verdict(phi + change, np.full(len(phi), size), values(chart, points))
+    log_d = proof._log_determinant(cardan_bounds.ENCLOSURE, chart.atlas, points)
+    found = proof._verdict(phi + change, np.full(len(phi), size), log_d)
     truth = chart.at(points)["spectral_radius"] > 1
     assert (found[found != 2] == truth[found != 2]).all() and (size > 0.1 or (found != 2).any())
 
 
 def test_without_damping_stable_means_distinct_multipliers_on_the_circle(undamped_chart):
     points = faces(undamped_chart, 2000, seed=4)
-    found, known = proof.verdicts(undamped_chart.atlas, points), undamped_chart.at(points)["verdict"]
+    found, known = proof.verdicts(undamped_chart.atlas, CARDAN, points), undamped_chart.at(points)["verdict"]
     decided = (found != 2) & (known != 2)
     assert (found[decided] == known[decided]).all() and decided.mean() > 0.95
     # At the angle 0 nothing is unstable, and multipliers that meet are open.
@@ -194,7 +197,7 @@ def test_other_domains_are_proved_too(ranges, fixed):
     chart = proved(cardan_atlas(ranges, 1e-10, fixed))
     assert all(panel.proved_error < 1e-10 for panel in chart.atlas.panels)
     points = faces(chart, 300)
-    found, (radius, _) = proof.verdicts(chart.atlas, points), direct_radius(chart, points)
+    found, (radius, _) = proof.verdicts(chart.atlas, CARDAN, points), direct_radius(chart, points)
     assert (found != 2).mean() > 0.97 and (found[found != 2] == (radius > 1)[found != 2]).all()
 
 
@@ -208,9 +211,9 @@ def test_nothing_is_proved_where_the_proof_does_not_hold(chart):
     strong = replace(chart.atlas, fixed={**chart.atlas.fixed, "zeta": 30.0})
     assert proof.proved_error(strong, panel, CARDAN) == np.inf
     sliced = chart.slice({"Omega": 1.0})
-    assert (proof.verdicts(sliced.atlas, np.array([[0.5], [0.9]])) == 2).all()
+    assert (proof.verdicts(sliced.atlas, CARDAN, np.array([[0.5], [0.9]])) == 2).all()
     # Beyond the box.
-    assert (proof.verdicts(chart.atlas, np.array([[1.3, 1.0], [0.5, 2.1]])) == 2).all()
+    assert (proof.verdicts(chart.atlas, CARDAN, np.array([[1.3, 1.0], [0.5, 2.1]])) == 2).all()
 
 
 @pytest.mark.parametrize("value", [1e-300, 1e300])
@@ -228,5 +231,5 @@ def test_middles_determine_the_balance(chart):
     domain, point = floquet_domain(CARDAN, RANGES, BASE), np.array([[0.7, 0.9]])
     phi = propagators({**BASE, "beta": 0.7, "Omega": 0.9}, 1e-14)
     expected = balanced_entries(CARDAN, domain, point, phi).reshape(4, 4)
-    found, error = proof.propagators(np.cos([0.7]), 1 / np.array([0.9]), BASE, middle_of(domain))
+    found, error = cardan_bounds.propagators(np.cos([0.7]), 1 / np.array([0.9]), BASE, middle_of(domain))
     assert np.linalg.norm(found[0, 0] - expected) <= error[0, 0] + 1e-13

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -98,3 +99,17 @@ def test_nothing_is_said_to_be_proved_without_a_proof(tmp_path, capsys):
     assert "theorem" not in file.attrs and "proved_error" not in file
     assert printed(capsys, "query", out, "mu=1", "Omega=1.3", "--json")["proved"] is False
     assert main(["verify", str(out), "--proof"]) == 2 and "holds no proof" in capsys.readouterr().err
+
+
+def test_a_run_and_verify_say_why_nothing_is_proved(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(proof, "_MOST_NODES", 100)
+    scene, out = tmp_path / "scene.toml", tmp_path / "atlas.nc"
+    axes = "\n".join(f"{name} = {{ start = {ends['start']}, stop = {ends['stop']} }}" for name, ends in AXES.items())
+    fixed = "\n".join(f"{name} = {value}" for name, value in BASE.items())
+    scene.write_text(f'system = "cardan"\nanalysis = "atlas"\n[axes]\n{axes}\n[fixed]\n{fixed}\n')
+    assert main(["run", str(scene), "--out", str(out)]) == 0
+    assert re.search(
+        "verdicts are estimates: a proof would need [0-9,]+ polynomials, more than 100", capsys.readouterr().err
+    )
+    assert main(["verify", str(out), "--proof"]) == 2
+    assert "holds no proof; a proof would need" in capsys.readouterr().err
