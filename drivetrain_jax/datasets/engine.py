@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -19,7 +20,6 @@ from xarray.core import indexing
 
 from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError, shown
-from drivetrain_jax._quantities import Parameter
 from drivetrain_jax.store.files import ATLAS_PREFACE
 
 if TYPE_CHECKING:
@@ -91,11 +91,10 @@ class AtlasEntrypoint(BackendEntrypoint):
 def _on_grid(path: str, grid: Any, solve: bool) -> xr.Dataset:
     from drivetrain_jax.analysis import OUTCOME
     from drivetrain_jax.runs.assemble import to_dataset
-    from drivetrain_jax.runs.atlas_chart import in_physical_units
     from drivetrain_jax.runs.atlas_file import PROVED
 
     whole = _opened(path, _stamp(path))
-    grid, views = _in_atlas_parameters(whole, grid)
+    grid, whole = _in_atlas_parameters(whole, grid)
     axes, fixed = _grid_values(whole, grid)
     cells = _Cells(path, axes, fixed, solve)
     atlas = cells.atlas({})
@@ -103,14 +102,14 @@ def _on_grid(path: str, grid: Any, solve: bool) -> xr.Dataset:
     shape = tuple(len(values) for values in axes.values())
     # Broadcast numbers take no memory.
     blank = {name: np.broadcast_to(value, (*shape, *value.shape)) for name, value in point.items()}
-    dataset = to_dataset(atlas.scene_on(axes), blank, {})
+    dataset = to_dataset(replace(atlas, views=whole.views).scene_on(axes), blank, {})
     degrees = np.max([(0,) * len(axes), *(panel.degrees for panel in atlas.stability.atlas.panels)], axis=0)
     chunks = _chunks(axes, dict(zip(atlas.parameters, degrees.tolist(), strict=True)))
     for name, value in point.items():
         variable = dataset[name].variable
         data = indexing.LazilyIndexedArray(_Result(cells, name, variable.shape, value.dtype))
-        sizes = dict(zip(variable.dims, variable.shape, strict=True))
-        dataset[name] = xr.Variable(variable.dims, data, variable.attrs, {"preferred_chunks": sizes | chunks})
+        sizes = dict(zip(variable.dims, (*chunks, *variable.shape[len(axes) :]), strict=True))
+        dataset[name] = xr.Variable(variable.dims, data, variable.attrs, {"preferred_chunks": sizes})
     if "verdict" in dataset:
         verdict = dataset["verdict"].variable
         flags = indexing.LazilyIndexedArray(_Result(cells, "proved", verdict.shape, np.dtype(bool)))
@@ -119,10 +118,7 @@ def _on_grid(path: str, grid: Any, solve: bool) -> xr.Dataset:
         about = dataset[OUTCOME.name].attrs
         about["flag_values"] = np.arange(gap() + 1, dtype=OUTCOME.dtype)
         about["flag_meanings"] += " gap"
-    dataset = dataset.assign_coords({name: ((), value, atlas.labels(name)) for name, value in fixed.items()})
-    for name, (quantity, convert) in views.items():
-        dataset = in_physical_units(dataset, name, quantity, convert)
-    return dataset
+    return whole.with_fixed(dataset, fixed)
 
 
 def gap() -> int:
@@ -132,8 +128,8 @@ def gap() -> int:
     return len(Outcome)
 
 
-def _chunks(axes: dict[str, Any], degrees: dict[str, int]) -> dict[str, int]:
-    """Sizes of chunks by axis, equal for all chunks where possible, because each size needs its own kernels.
+def _chunks(axes: dict[str, Any], degrees: dict[str, int]) -> list[int]:
+    """Sizes of chunks along the axes, equal for all chunks where possible, because each size needs its own kernels.
 
     Chunks are long along the two longest axes, whose cells are evaluated together. Among axes of equal length, those with
     low ``degrees`` come first, which take less work.
@@ -145,32 +141,30 @@ def _chunks(axes: dict[str, Any], degrees: dict[str, int]) -> dict[str, int]:
         most = math.isqrt(_CHUNK) if name == longest[0] and len(axes) > 1 else left
         chunks[name] = -(-length // -(-length // max(1, min(length, most, _LONGEST))))
         left //= chunks[name]
-    return {name: chunks[name] for name in axes}
+    return [chunks[name] for name in axes]
 
 
-def _in_atlas_parameters(atlas: StoredAtlas, grid: Any) -> tuple[Any, dict[str, tuple[Parameter, Any]]]:
-    """``grid`` with parameters of the atlas for physical data and texts, and the quantities that replace parameters.
+def _in_atlas_parameters(atlas: StoredAtlas, grid: Any) -> tuple[Any, StoredAtlas]:
+    """``grid`` with parameters of the atlas for physical data and texts, and the atlas that shows these data.
 
-    A quantity comes with the function that gives its values. Raises :class:`InputError` for physical data that do not
-    determine a parameter.
+    Raises :class:`InputError` for physical data that do not determine a parameter.
     """
-    from drivetrain_jax.runs.physical import in_parameters
-
     names = atlas.scene.system.physical.names if atlas.scene.system.physical else ()
-    if not isinstance(grid, Mapping) or not any(name in names or _is_written(value) for name, value in grid.items()):
-        return grid, {}
+    if not isinstance(grid, Mapping):
+        return grid, atlas
+    if not any(name in names or _is_written(value) for name, value in grid.items()):
+        return grid, atlas.viewed({}, grid)
     counts = {name: value for name, value in grid.items() if _is_count(value)}
     rows = {name: value[:2] if _is_range(value) else value for name, value in grid.items() if name not in counts}
-    given, _ = in_parameters(atlas.scene.system, rows, atlas.scene.data)
-    found = atlas.in_parameters(rows)
+    atlas, found = atlas.viewed(rows, counts), atlas.in_parameters(rows)
+    parameters = {quantity.name: name for name, (quantity, _) in atlas.views.items()}
     for name, value in grid.items():
-        parameter = given.parameter_of(name) if given else name
+        parameter: Any = parameters.get(name, name)
         if name in counts:
             found[parameter] = value
         elif parameter in found and _is_range(value):
             found[parameter] = (*found[parameter], value[2])
-    backs = {name: given.back(name) for name in found if given and name not in grid}
-    return found, {name: back for name, back in backs.items() if back and back[0].name in grid}
+    return found, atlas
 
 
 def _is_written(given: Any) -> bool:
@@ -206,17 +200,18 @@ def _grid_values(atlas: StoredAtlas, grid: Any) -> tuple[dict[str, np.ndarray], 
 
 def _values(atlas: StoredAtlas, name: str, given: Any) -> np.ndarray:
     """The values of a parameter that varies, or the one that it has."""
+    label = atlas.viewed_as(name)[0].name
     start, stop, count = (*atlas.ranges[name], given) if _is_count(given) else given if _is_range(given) else (0, 0, 0)
     if count < 2 and (_is_count(given) or _is_range(given)):
-        allowed = f"allowed is 2 or more; {float(count)} would fix {name}"
-        raise InputError(f"grid.{name} = {count}: is a number of values; {allowed}")
+        allowed = f"allowed is 2 or more; {float(count)} would fix {label}"
+        raise InputError(f"grid.{label} = {count}: is a number of values; {allowed}")
     try:
         values = np.linspace(float(start), float(stop), count) if count else np.asarray(given)
     # Words, and rows of different lengths.
     except (TypeError, ValueError):
         values = np.empty(0)
     if values.dtype.kind not in "iuf" or values.ndim > 1 or not values.size:
-        raise InputError(f"grid.{name} = {shown(given)}: allowed is {_ALLOWED}")
+        raise InputError(f"grid.{label} = {shown(given)}: allowed is {_ALLOWED}")
     atlas.check_within(name, values)
     return values.astype(float)
 

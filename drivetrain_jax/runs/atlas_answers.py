@@ -114,14 +114,15 @@ class AtlasQuery:
                 check_same(name, value, atlas.fixed[name], source)
         kept = {name for name in atlas.parameters if name not in free or name in within}
         own = {name: _within(value, atlas.ranges[name]) for name, value in values.items() if name in kept}
+        backs = {name: shaft.back(name) for name in atlas.parameters if shaft and name not in given}
+        seen = replace(atlas, views={name: back for name, back in backs.items() if back})
         for name in values:
             if name not in atlas.parameters and name not in atlas.fixed:
                 physical = atlas.scene.system.physical
-                atlas.refuse(name, values[name], *atlas.fixed, *(physical.names if physical else ()))
+                seen.refuse(name, values[name], *atlas.fixed, *(physical.names if physical else ()))
         for name in atlas.parameters:
             if name not in free or name in own:
-                words = _Words.of(atlas, None if name in given else shaft, name)
-                _check_range(words, atlas.ranges[name], own.get(name), name in (*ranges, *within))
+                _check_range(seen, name, own.get(name), name in (*ranges, *within))
         return cls(atlas, own, shaft)
 
     def numbers(self) -> dict[str, float]:
@@ -194,42 +195,24 @@ def _within(value: Any, ends: Range) -> Any:
     return next((end for end in ends if math.isclose(value, end, rel_tol=_SAME)), value)
 
 
-@dataclass(frozen=True)
-class _Words:
-    """Texts for a parameter of the atlas, its range and its values, in the units of the input."""
-
-    name: str
-    allowed: str
-    convert: Callable[[float], float] = lambda value: value
-
-    @classmethod
-    def of(cls, atlas: StoredAtlas, shaft: Any, name: str) -> _Words:
-        physical: list[Any] = [shaft.quantity(name, end) for end in atlas.ranges[name]] if shaft else [None, None]
-        if physical[0] is None:
-            return cls(name, atlas.allowed(name))
-        (label, low, units), (_, high, _) = physical
-        allowed = f"{low:.10g} <= {label} <= {high:.10g}, in {units}"
-        return cls(label, allowed, lambda value: shaft.quantity(name, value)[1])
-
-    def given(self, value: Any) -> str:
-        """A value or a range in the units of the input."""
-        ends = value if isinstance(value, tuple) else (value,)
-        shown = tuple(self.convert(end) if isinstance(end, float) else end for end in ends)
-        return as_given(shown if isinstance(value, tuple) else shown[0])
-
-
-def _check_range(words: _Words, ends: Range, value: Any, wanted: bool) -> None:
-    allowed = f"allowed is {f'{words.name}=LOW:HIGH within ' if wanted else ''}{words.allowed}"
+def _check_range(atlas: StoredAtlas, name: str, value: Any, wanted: bool) -> None:
+    """Raise :class:`InputError` unless ``value`` is a number, or a rising range if ``wanted``, within the atlas."""
+    low, high = atlas.ranges[name]
+    label: str = atlas.viewed_as(name)[0].name
+    ends = value if isinstance(value, tuple) else (value,)
+    allowed = f"allowed is {f'{label}=LOW:HIGH within ' if wanted else ''}{atlas.allowed(name)}"
     if value is None:
-        raise InputError(f"{words.name}: missing; {allowed}")
+        raise InputError(f"{label}: missing; {allowed}")
+    numbers = [atlas.viewed_as(name, end)[-1] if isinstance(end, float) else end for end in ends]
+    shown = as_given(tuple(numbers))
     if isinstance(value, tuple) != wanted:
         needed = "a range is needed" if wanted else "is a range"
-        raise InputError(f"{words.name} = {words.given(value)}: {needed}; {allowed}")
-    for end in value if wanted else (value,):
-        if isinstance(end, bool) or not isinstance(end, (int, float)) or not ends[0] <= end <= ends[1]:
-            raise InputError(f"{words.name} = {words.given(end)}: {allowed}")
+        raise InputError(f"{label} = {shown}: {needed}; {allowed}")
+    for end, each in zip(ends, numbers, strict=True):
+        if isinstance(end, bool) or not isinstance(end, (int, float)) or not low <= end <= high:
+            raise InputError(f"{label} = {as_given(each)}: {allowed}")
     if wanted and not value[0] < value[1]:
-        raise InputError(f"{words.name} = {words.given(value)}: allowed is a rising range")
+        raise InputError(f"{label} = {shown}: allowed is a rising range")
 
 
 def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None) -> Reply:

@@ -17,7 +17,6 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._errors import shown as quoted
 from drivetrain_jax._programs import program_identity, remembered
 from drivetrain_jax._quantities import Parameter
-from drivetrain_jax._units import factor
 from drivetrain_jax.atlas import to_arrays
 from drivetrain_jax.atlas.boundaries import boundaries
 from drivetrain_jax.atlas.criteria import has_boundaries
@@ -26,8 +25,6 @@ from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.tips import Tips, find_tips
 from drivetrain_jax.atlas.windows import narrow
 from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, check_same, open_atlas
-from drivetrain_jax.runs.axes import in_unit
-from drivetrain_jax.runs.physical import in_parameters
 from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.store.files import source_digest
 from drivetrain_jax.systems import System
@@ -48,8 +45,7 @@ def chart(source: str | Path | xr.Dataset, part: Mapping[str, float | tuple[floa
     """
     if not isinstance(cells, (int, np.integer)) or isinstance(cells, bool) or not 2 <= cells <= 20_000:
         raise InputError(f"cells = {quoted(cells)}: allowed is a whole number, 2 <= cells <= 20000")
-    atlas = open_atlas(source)
-    views = _physical_views(atlas, part)
+    atlas = open_atlas(source).viewed(part)
     ranges = _ranges(atlas, atlas.in_parameters(part))
     fixed = {name: value for name, value in ranges.items() if not isinstance(value, tuple)}
     shown = _shown(atlas.scene.system, [name for name in ranges if name not in fixed])
@@ -64,7 +60,7 @@ def chart(source: str | Path | xr.Dataset, part: Mapping[str, float | tuple[floa
     if len(shown) > 1 and has_boundaries(atlas.stability.atlas, atlas.scene.system):
         plane, slices = {n: ranges[n] for n in shown[:2]}, {n: axes[n] for n in axes if n not in shown[:2]}
         dataset = dataset.assign_coords(_stored_curves(atlas, fixed, plane, slices))
-    for name, (quantity, convert) in views.items():
+    for name, (quantity, convert) in atlas.views.items():
         dataset = in_physical_units(dataset, name, quantity, convert)
     return dataset
 
@@ -107,26 +103,6 @@ def with_boundaries(dataset: xr.Dataset, source: str | Path | xr.Dataset) -> xr.
     return dataset
 
 
-def _physical_views(atlas: StoredAtlas, part: Mapping[str, Any]) -> dict[str, tuple[Parameter, Convert]]:
-    """For each parameter that the scene or ``part`` gives in physical data: the quantity, and the way to its values."""
-    given, _ = in_parameters(atlas.scene.system, part, atlas.scene.data)
-    if given is None:
-        return {}
-    swept = {axis.name: axis.shown.parameter.units for axis in atlas.scene.axes if axis.given}
-    views: dict[str, tuple[Parameter, Convert]] = {}
-    for name in atlas.parameters:
-        found = given.back(name)
-        if found is not None and (name in swept or found[0].name in part):
-            quantity, back = found
-            unit = swept.get(name, quantity.units)
-            views[name] = (in_unit(quantity, unit), partial(_back, back, factor(quantity.units, unit)))
-    return views
-
-
-def _back(back: Convert, size: float, values: Any) -> Any:
-    return back(values) * size
-
-
 def in_physical_units(dataset: xr.Dataset, name: str, quantity: Parameter, convert: Convert) -> xr.Dataset:
     """``dataset`` with the parameter ``name``, its boundaries and its tips also, or instead, as physical data."""
     other, own = quantity.name, dataset[name]
@@ -156,7 +132,9 @@ def _ranges(atlas: StoredAtlas, part: Mapping[str, Any]) -> dict[str, Any]:
         low, high = atlas.ranges[name]
         rising = not isinstance(value, tuple) or value[0] < value[1]
         if not rising or not all(low <= end <= high for end in np.atleast_1d(value)):
-            raise InputError(f"{name} = {as_given(value)}: allowed is a number or LOW:HIGH, {atlas.allowed(name)}")
+            shown, *ends = atlas.viewed_as(name, *np.atleast_1d(value))
+            text = as_given(tuple(ends))
+            raise InputError(f"{shown.name} = {text}: allowed is a number or LOW:HIGH, {atlas.allowed(name)}")
     return {name: part.get(name, atlas.ranges[name]) for name in atlas.parameters}
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Container, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -13,13 +13,15 @@ import numpy as np
 
 from drivetrain_jax import _programs
 from drivetrain_jax._errors import InputError, counted, did_you_mean, shown
+from drivetrain_jax._quantities import Parameter
+from drivetrain_jax._units import factor
 from drivetrain_jax.analysis import OUTCOME, Request, get_analysis
 from drivetrain_jax.analysis._base import make_request
 from drivetrain_jax.analysis.atlas import ANALYSIS
 from drivetrain_jax.atlas import StabilityAtlas, from_arrays, proof, stability_atlas, to_arrays
 from drivetrain_jax.atlas.floquet import floquet_domain, smoothness
 from drivetrain_jax.runs.assemble import ResultBuffer, labelled, result_attrs, to_dataset
-from drivetrain_jax.runs.axes import Axis
+from drivetrain_jax.runs.axes import Axis, in_unit
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.physical import in_parameters
 from drivetrain_jax.runs.reuse import ReusedPoints
@@ -35,6 +37,8 @@ if TYPE_CHECKING:
 
     from drivetrain_jax.explore import Page
 
+# The quantity that is shown for a parameter, and the way to its values.
+View = tuple[Parameter, Callable[[Any], Any]]
 # Relative tolerance within which a value equals a fixed parameter of an atlas.
 SAME_FIXED = 5e-4
 
@@ -102,7 +106,7 @@ _ATTRIBUTES = ("scene", "coordinates_of_panels", "tolerance", "solves")
 
 def to_labelled(stability: StabilityAtlas, scene: Scene) -> Labelled:
     """The result of a scene of an atlas: its panels, and a chart that readers without this package show."""
-    stored = StoredAtlas(scene, replace(stability, keep=partial(_programs.kept, scene.system)))
+    stored = StoredAtlas(scene, replace(stability, keep=partial(_programs.kept, scene.system))).viewed({})
     atlas, chart = stability.atlas, _chart(stored)
     arrays = to_arrays(atlas)
     data = {
@@ -134,7 +138,7 @@ def _chart(atlas: StoredAtlas) -> Labelled:
     axes = {name: np.linspace(*atlas.ranges[name], _CELLS) for name in shown}
     part = atlas.slice(middle)
     whole = labelled(part.scene_on(axes), part.arrays(axes, solve=False), {})
-    fixed = {name: Entry((), np.array(value), atlas.labels(name)) for name, value in middle.items()}
+    fixed = {n: Entry(*entry) for name, x in middle.items() for n, entry in atlas.coordinates(name, x).items()}
     # An outcome counts points of a run, and an atlas has none.
     return Labelled({**whole.coords, **fixed}, {n: e for n, e in whole.data.items() if n != OUTCOME.name}, {})
 
@@ -169,7 +173,7 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
     used = {name: scene.fixed[name] for name in scene.system.models["atlas"].parameters if name in scene.fixed}
     atlas = from_arrays(arrays, names, domain.coordinates, used, attrs["tolerance"], attrs["solves"])
     stability = stability_atlas(atlas, scene.system, scene.request.options["rtol"])
-    return StoredAtlas(scene, replace(stability, keep=partial(_programs.kept, scene.system)))
+    return StoredAtlas(scene, replace(stability, keep=partial(_programs.kept, scene.system))).viewed({})
 
 
 def _content(source: str | Path | xr.Dataset, label: str) -> tuple[dict[str, np.ndarray], Mapping[str, Any]]:
@@ -209,10 +213,12 @@ class StoredAtlas:
     """A stability atlas as a function: ``atlas(beta=0.31, Omega=1.2)``.
 
     ``scene`` is the scene that computed it; ``stability`` evaluates its panels. Points in gaps are solved directly.
+    ``views`` are the quantities that results and messages show for parameters.
     """
 
     scene: Scene
     stability: StabilityAtlas
+    views: Mapping[str, View] = field(default_factory=dict)
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -233,9 +239,30 @@ class StoredAtlas:
 
     def allowed(self, name: str) -> str:
         """The range of a parameter as text: ``0 <= beta <= 1.5, in rad``."""
-        low, high = self.ranges[name]
-        units = self.scene.system.parameter(name).units
-        return f"{low:.10g} <= {name} <= {high:.10g}" + ("" if units == "1" else f", in {units}")
+        shown, low, high = self.viewed_as(name, *self.ranges[name])
+        return f"{low:.10g} <= {shown.name} <= {high:.10g}" + ("" if shown.units == "1" else f", in {shown.units}")
+
+    def viewed_as(self, name: str, *values: Any) -> tuple[Any, ...]:
+        """The quantity that is shown for a parameter, or the parameter itself, and ``values`` of it."""
+        quantity, convert = self.views.get(name) or (self.scene.system.parameter(name), _same)
+        return quantity, *map(convert, values)
+
+    def viewed(self, given: Mapping[str, Any], named: Container[str] = ()) -> StoredAtlas:
+        """The atlas with physical data in place of parameters that its scene or ``given`` has as such, or that are named.
+
+        Numbers in ``given`` have the quantity's own unit, everything else that of the scene.
+        """
+        data = in_parameters(self.scene.system, given, self.scene.data)[0]
+        units = {axis.name: axis.shown.parameter.units for axis in self.scene.axes if axis.given}
+        views: dict[str, View] = {}
+        for name in self.parameters:
+            back = data.back(name) if data and name not in given and name not in named else None
+            quantity, convert = back or (None, _same)
+            if quantity and (name in units or quantity.name in given or quantity.name in named):
+                written = np.asarray(given.get(quantity.name, "")).dtype.kind == "U"
+                unit = units.get(name, quantity.units) if written else quantity.units
+                views[name] = in_unit(quantity, unit), partial(_scaled, convert, factor(quantity.units, unit))
+        return replace(self, views=views)
 
     def labels(self, name: str) -> dict[str, str]:
         """Unit and meaning of a parameter, as attributes."""
@@ -247,19 +274,21 @@ class StoredAtlas:
         low, high = self.ranges[name]
         outside = numbers[~((numbers >= low) & (numbers <= high))]
         if outside.size:
-            raise InputError(f"{name} = {outside.flat[0]:.10g}: allowed is {self.allowed(name)}")
+            shown, value = self.viewed_as(name, outside.flat[0])
+            raise InputError(f"{shown.name} = {value:.10g}: allowed is {self.allowed(name)}")
 
     def refuse(self, name: str, value: Any, *others: str) -> NoReturn:
         """Raise :class:`InputError` for a name that is neither a parameter nor one of ``others``."""
         if name in self.fixed:
             made = f"the atlas is made for {name} = {as_given(self.fixed[name])}"
             raise InputError(f"{name} = {as_given(value)}: {made}; allowed is to leave it out")
-        guess = did_you_mean(name, (*self.parameters, *others))
+        guess = did_you_mean(name, (*self.parameters, *(shown.name for shown, _ in self.views.values()), *others))
         allowed = "; ".join(map(self.allowed, self.parameters))
         raise InputError(f"{name} = {as_given(value)}: not a parameter of the atlas{guess}; allowed is {allowed}")
 
     def __repr__(self) -> str:
-        ranges = ", ".join(f"{name} {a:g} to {b:g}" for name, (a, b) in self.ranges.items())
+        ends = [self.viewed_as(name, *ends) for name, ends in self.ranges.items()]
+        ranges = ", ".join(f"{q.name} {a:g} to {b:g}{'' if q.units == '1' else f' {q.units}'}" for q, a, b in ends)
         atlas = self.stability.atlas
         fixed = ", ".join(f"{name} = {value:g}" for name, value in self.fixed.items())
         parts = f"{counted(len(atlas.panels), 'panel', 'panels')}, {counted(len(atlas.gaps), 'gap', 'gaps')}"
@@ -274,7 +303,7 @@ class StoredAtlas:
         """
         import xarray as xr
 
-        values = self.in_parameters(values)
+        self, values = self.viewed(values), self.in_parameters(values)
         checked = {name: self._checked(name, values) for name in self._names(values)}
         columns = dict(zip(checked, broadcast(checked), strict=True))
         whole = columns[self.parameters[0]]
@@ -290,29 +319,45 @@ class StoredAtlas:
             verdict = np.asarray(found["verdict"].values)
             data["proved"] = (dims, self.proved(flat, verdict).reshape(shape), PROVED)
         labels = {dim: whole.coords[dim] for dim in dims if dim in whole.coords}
-        given = {name: v if isinstance(v, xr.DataArray) else columns[name] for name, v in checked.items()}
-        coords = {name: (v.dims, np.asarray(v.values, float), found[name].attrs) for name, v in given.items()}
-        return xr.Dataset(data, labels | coords, found.attrs)
+        for name, value in checked.items():
+            column = value if isinstance(value, xr.DataArray) else columns[name]
+            labels |= self.coordinates(name, column.values, column.dims)
+        return xr.Dataset(data, labels, found.attrs)
 
-    def grid(self, **values: Any) -> xr.Dataset:
+    def grid(self, **given: Any) -> xr.Dataset:
         """Results on the outer product of arrays, as of a scene with these axes; a number fixes its parameter.
 
         The dimensions have the order in which the arrays are given; a number is a coordinate without a dimension. Raises
         the errors of a call.
         """
-        values = self.in_parameters(values)
+        self, values = self.viewed(given), self.in_parameters(given)
         self._names(values)
-        given = {name: np.asarray(self._checked(name, values), float) for name in values}
-        axes = {name: column for name, column in given.items() if column.ndim}
+        order = {name: k for k, name in enumerate(given)}
+        names = sorted(values, key=lambda name: order.get(self.viewed_as(name)[0].name, len(order)))
+        columns = {name: np.asarray(self._checked(name, values), float) for name in names}
+        axes = {name: column for name, column in columns.items() if column.ndim}
         for name, column in axes.items():
             if column.ndim > 1 or not column.size:
-                raise InputError(f"{name}: an array of shape {column.shape}; allowed is a number or a row of numbers")
+                shown = self.viewed_as(name)[0].name
+                raise InputError(f"{shown}: an array of shape {column.shape}; allowed is a number or a row of numbers")
         if not axes:
-            return self(**values)
-        fixed = {name: float(column) for name, column in given.items() if not column.ndim}
+            return self(**given)
+        fixed = {name: float(column) for name, column in columns.items() if not column.ndim}
         part = self.slice(fixed)
-        scalars = {name: ((), value, self.labels(name)) for name, value in fixed.items()}
-        return to_dataset(part.scene_on(axes), part.arrays(axes), {}).assign_coords(scalars)
+        return self.with_fixed(to_dataset(part.scene_on(axes), part.arrays(axes), {}), fixed)
+
+    def with_fixed(self, dataset: xr.Dataset, fixed: Mapping[str, float]) -> xr.Dataset:
+        """``dataset`` with ``fixed`` parameters as coordinates."""
+        for name, value in fixed.items():
+            dataset = dataset.assign_coords(self.coordinates(name, value))
+        return dataset
+
+    def coordinates(self, name: str, values: Any, dims: tuple[Any, ...] = ()) -> dict[str, Any]:
+        """A parameter as a coordinate, behind the quantity that is shown for it."""
+        values = np.asarray(values, float)
+        shown, quantity = self.viewed_as(name, values)
+        about = {"units": shown.units, "long_name": shown.long_name}
+        return {shown.name: (dims, quantity, about), name: (dims, values, self.labels(name))}
 
     def explore(self) -> Page:
         """The explorer: an HTML page that evaluates the atlas in the browser, which a notebook shows.
@@ -396,7 +441,7 @@ class StoredAtlas:
                 self.refuse(name, values[name])
         for name in self.parameters:
             if name not in values:
-                raise InputError(f"{name}: missing; allowed is {self.allowed(name)}")
+                raise InputError(f"{self.viewed_as(name)[0].name}: missing; allowed is {self.allowed(name)}")
         return self.parameters
 
     def _checked(self, name: str, values: Mapping[str, Any]) -> Any:
@@ -410,12 +455,25 @@ class StoredAtlas:
         self.check_within(name, numbers)
         return values[name]
 
+    def _axis(self, name: str, values: np.ndarray) -> Axis:
+        shown, quantity = self.viewed_as(name, values)
+        given = (Axis(shown.name, shown, None, quantity),) if name in self.views else ()
+        return Axis(name, self.scene.system.parameter(name), None, values, given)
+
     def _scene(self, axes: Mapping[str, np.ndarray], fixed: Mapping[str, Any], request: Request, zipped: bool) -> Scene:
         scene, system = self.scene, self.scene.system
-        columns = tuple(Axis(name, system.parameter(name), None, np.asarray(v, float)) for name, v in axes.items())
+        columns = tuple(self._axis(name, np.asarray(v, float)) for name, v in axes.items())
         fixed = dict(scene.fixed) | {name: value for name, value in fixed.items() if name not in axes}
         floquet = get_analysis("floquet").for_system(system)
         return Scene(system, floquet, request, columns, zipped, fixed, scene.title, scene.text, scene.data)
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+def _scaled(convert: Callable[[Any], Any], size: float, values: Any) -> Any:
+    return convert(values) * size
 
 
 def verify_proof(path: Path) -> tuple[str, str]:

@@ -235,6 +235,36 @@ def test_physical_data_make_a_grid(file, atlas):
         opened(file, {"speed": (1100.0, 1700.0, 4)})
 
 
+def test_axes_of_a_scene_in_physical_data_name_the_results():
+    """Axes of the scene name dimensions and values in its units; numbers in a question have the quantity's own unit."""
+    axes = {"speed": {"start": "22 Hz", "stop": "25 Hz"}, "c1": {"start": "0.1 N m s/rad", "stop": "0.5 N m s/rad"}}
+    fixed = {"J1": 2.0, "J2": 0.5, "k1": 6e4, "k2": 4e4, "alpha": 0.4082, "angle": 12.0}
+    file = atlas_file(ATLAS | {"axes": axes, "fixed": fixed})
+    atlas, hertz = dt.open_atlas(file), opened(file, {"speed": 4, "c1": 2})
+    assert hertz["verdict"].dims == ("speed", "c1") and opened(file, None)["verdict"].dims == ("speed", "c1")
+    assert hertz["speed"].attrs["units"] == "Hz" and list(hertz.coords) == ["speed", "Omega", "c1", "zeta"]
+    np.testing.assert_allclose(hertz["speed"], [22, 23, 24, 25], rtol=1e-14)
+    np.testing.assert_allclose(hertz["Omega"], hertz["speed"] * 2 * np.pi * np.sqrt(2 / 6e4), rtol=1e-14)
+    rpm = atlas.grid(c1=[0.1, 0.5], speed=[1320.0, 1500.0])
+    assert rpm["verdict"].dims == ("c1", "speed") and rpm["speed"].attrs["units"] == "rpm"
+    np.testing.assert_allclose(rpm["speed"], [1320, 1500], rtol=1e-15)
+    np.testing.assert_allclose(rpm["spectral_radius"].T, hertz["spectral_radius"][[0, 3]], rtol=1e-10)
+    point = atlas(speed=1425.0, c1=0.1)
+    assert float(point["speed"]) == pytest.approx(1425, rel=1e-15) and point["verdict"] == 1
+    assert opened(file, {"Omega": 3, "c1": 0.2})["verdict"].dims == ("Omega",)
+    for wrong, message in (
+        (lambda: atlas(speed=1600.0, c1=0.2), "speed = 1600: allowed is 1320 <= speed <= 1500, in rpm"),
+        (lambda: atlas(speed="23 Hz"), "c1: missing; allowed is 0.1 <= c1 <= 0.5, in N m s/rad"),
+        (lambda: opened(file, {"speed": 5, "c1": 0.7}), "c1 = 0.7: allowed is 0.1 <= c1 <= 0.5, in N m s/rad"),
+        (lambda: opened(file, {"speed": 1}), "grid.speed = 1: is a number of values"),
+    ):
+        with pytest.raises(dt.InputError) as refused:
+            wrong()
+        assert str(refused.value).startswith(message)
+    with xr.open_dataset(file, engine="h5netcdf") as chart:
+        assert chart["verdict"].dims == ("speed", "c1")
+
+
 @pytest.mark.parametrize(
     ("grid", "message"),
     [
