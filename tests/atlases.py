@@ -14,6 +14,13 @@ from filelock import FileLock
 import drivetrain_jax as dt
 from drivetrain_jax.runs.output import status
 
+# A shaft of a data sheet, around its first resonance.
+SHAFT = {
+    "system": "cardan",
+    "analysis": "atlas",
+    "axes": {"speed": {"start": "22 Hz", "stop": "25 Hz"}, "c1": {"start": "0.1 N m s/rad", "stop": "0.5 N m s/rad"}},
+    "fixed": {"J1": 2.0, "J2": 0.5, "k1": 6e4, "k2": 4e4, "alpha": 0.4082, "angle": 12.0},
+}
 FOLDER = Path(__file__).parents[1] / ".pytest_cache" / "atlases"
 
 

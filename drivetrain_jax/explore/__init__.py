@@ -21,6 +21,7 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.atlas.interpolation import coefficients, evaluate, tensor_nodes
 from drivetrain_jax.atlas.panels import Atlas, Panel, to_arrays
+from drivetrain_jax.runs.physical import GivenData, in_parameters
 from drivetrain_jax.systems import Coordinate, FloquetModel, System
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def pack(stored: StoredAtlas) -> dict[str, Any]:
     """
     scene, stability = stored.scene, stored.stability
     atlas, system = stability.atlas, scene.system
-    form = stability.form
+    form, shaft = stability.form, in_parameters(system, {}, scene.data)[0]
     if form.reversal is not None:
         raise InputError(
             f"system = {system.name!r}: reverses time by matrices; allowed is a constant reversor, or none"
@@ -69,8 +70,11 @@ def pack(stored: StoredAtlas) -> dict[str, Any]:
         "system": {"name": system.name, "title": system.title},
         "parameters": [_parameter(atlas, system, k) for k in range(len(atlas.parameters))],
         "fixed": {
-            name: _fixed(system, name, value) for name, value in scene.fixed.items() if name not in atlas.parameters
+            name: _fixed(system, shaft, name, value)
+            for name, value in scene.fixed.items()
+            if name not in atlas.parameters
         },
+        "units": _units(system, shaft),
         "rtol": stability.rtol,
         "size": form.size,
         "halves": form.halves,
@@ -119,11 +123,24 @@ def _form_of(coordinate: Coordinate, name: str, lower: float, upper: float) -> s
     )
 
 
-def _fixed(system: type[System], name: str, value: Any) -> dict[str, Any]:
-    described = system.parameter(name)
-    # As in a scene: JSON has no infinity.
+def _fixed(system: type[System], shaft: GivenData | None, name: str, value: Any) -> dict[str, Any]:
+    """A fixed value as in a scene (``text``), and as readers see it (``shown``): as physical data if these are known."""
+    # JSON has no infinity.
     text = str(value) if isinstance(value, float) else json.dumps(value)
-    return {"text": text, "units": described.units, "long_name": described.long_name}
+    known = shaft.quantity(name, value) if shaft and isinstance(value, float) else None
+    label, number, units = known or (name, value, system.parameter(name).units)
+    shown = f"{number:.6g}" if isinstance(number, float) else text
+    return {"text": text, "shown": f"{label} = {shown}{'' if units == '1' else f' {units}'}"}
+
+
+def _units(system: type[System], shaft: GivenData | None) -> dict[str, Any]:
+    """The units in which the page begins: those of physical data where the file knows these."""
+    speed, inertia, stiffness = system.roles.get("speed"), None, None
+    for each in shaft.physical.conversions if shaft else ():
+        if shaft and each.parameter == speed and len(each.needs) == 3:
+            inertia, stiffness = (shaft.data.get(name) for name in each.needs[1:])
+    known = bool(inertia and stiffness)
+    return {"angle": "deg" if shaft else "rad", "speed": "rpm" if known else "1", "J": inertia, "k": stiffness}
 
 
 def _model(atlas: Atlas, build: Callable[..., FloquetModel], points: np.ndarray) -> FloquetModel:

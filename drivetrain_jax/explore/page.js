@@ -211,8 +211,7 @@ function drawing(app) {
 function buildControls(app) {
   const { atlas } = app, changeTo = (id, edit, whole = true) => get(id).addEventListener("change", () => app.change((state) => edit(state, get(id)), whole && "whole"));
   get("title").textContent = atlas.title || atlas.system.title;
-  const fixed = Object.entries(atlas.fixed).map(([name, { text, units }]) => `${name} = ${text}${units === "1" ? "" : ` ${units}`}`);
-  get("about").textContent = [atlas.system.title, ...fixed].join(", ");
+  get("about").textContent = [atlas.system.title, ...Object.values(atlas.fixed).map(({ shown }) => shown)].join(", ");
   for (const id of ["across", "up"]) get(id).append(...atlas.parameters.map((p, k) => new Option(app.caption(k), p.name)));
   const swap = (state, at, name) => {
     const k = atlas.parameters.findIndex((p) => p.name === name), other = state.axes.length - 1 - at;

@@ -87,7 +87,7 @@ export function toHash(atlas, state) {
   if (state.panes.length > 1)
     names.forEach((name, k) => state.axes.includes(k) || said.set(`B.${name}`, shown(state.panes[1].values[k], 12)));
   if (state.panes.length > 1) said.set("compare", "1");
-  for (const key of ["angle", "speed", "J", "k"]) if (state.units[key] && state.units[key] !== "1" && state.units[key] !== "rad") said.set(key, state.units[key]);
+  for (const key of ["angle", "speed", "J", "k"]) if (state.units[key] && state.units[key] !== atlas.units[key]) said.set(key, state.units[key]);
   if (state.band.every(Number.isFinite)) said.set("band", state.band.map((v) => shown(v, 12)).join(":"));
   return said.toString().replaceAll("%3A", ":");
 }
@@ -109,7 +109,8 @@ export function fromHash(atlas, text) {
   const panes = [{ values, map: map("map") }];
   if (said.get("compare")) panes.push({ values: names.map((name, k) => (axes.includes(k) ? values[k] : clamp(k, get(`B.${name}`), values[k]))), map: map("B.map") });
   const band = (said.get("band") || ":").split(":").map((v) => (v.trim() ? Number(v) : NaN));
-  const units = { angle: said.get("angle") === "deg" ? "deg" : "rad", speed: said.get("speed") === "rpm" ? "rpm" : "1", J: get("J") || NaN, k: get("k") || NaN };
+  const either = (key, ...words) => (words.includes(said.get(key)) ? said.get(key) : atlas.units[key]);
+  const units = { angle: either("angle", "rad", "deg"), speed: either("speed", "1", "rpm"), J: get("J") || (atlas.units.J ?? NaN), k: get("k") || (atlas.units.k ?? NaN) };
   return { axes, lower, upper, panes, units, band: band.length === 2 && band[0] < band[1] ? band : [NaN, NaN] };
 }
 

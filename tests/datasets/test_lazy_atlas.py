@@ -19,7 +19,7 @@ from drivetrain_jax.atlas.panels import position
 from drivetrain_jax.datasets.engine import gap
 from drivetrain_jax.runs import through_atlas
 from drivetrain_jax.runs.atlas_file import StoredAtlas
-from tests.atlases import atlas_file
+from tests.atlases import SHAFT, atlas_file
 from tests.sizes import but_full
 
 ATLAS = {
@@ -237,9 +237,7 @@ def test_physical_data_make_a_grid(file, atlas):
 
 def test_axes_of_a_scene_in_physical_data_name_the_results():
     """Axes of the scene name dimensions and values in its units; numbers in a question have the quantity's own unit."""
-    axes = {"speed": {"start": "22 Hz", "stop": "25 Hz"}, "c1": {"start": "0.1 N m s/rad", "stop": "0.5 N m s/rad"}}
-    fixed = {"J1": 2.0, "J2": 0.5, "k1": 6e4, "k2": 4e4, "alpha": 0.4082, "angle": 12.0}
-    file = atlas_file(ATLAS | {"axes": axes, "fixed": fixed})
+    file = atlas_file(SHAFT)
     atlas, hertz = dt.open_atlas(file), opened(file, {"speed": 4, "c1": 2})
     assert hertz["verdict"].dims == ("speed", "c1") and opened(file, None)["verdict"].dims == ("speed", "c1")
     assert hertz["speed"].attrs["units"] == "Hz" and list(hertz.coords) == ["speed", "Omega", "c1", "zeta"]

@@ -14,6 +14,7 @@ import xarray as xr
 
 import drivetrain_jax as dt
 from drivetrain_jax.cli import main
+from tests.atlases import SHAFT, stored_atlas
 from tests.explore.browser import CHROMIUM, Browser
 from tests.explore.conftest import NODE, columns
 
@@ -104,6 +105,22 @@ def test_the_address_holds_the_state(two):
     # What is not valid is left out.
     wrong = texts(two, "beta=9&Omega=x&x=no&view.Omega=3:1&J=-1&band=5")["state"]
     assert wrong["panes"][0]["values"] == [1.4, 1.1] and wrong["lower"] == [-0.2, 0.2] and wrong["axes"] == [0, 1]
+
+
+@needs_node
+def test_the_page_begins_with_the_data_that_the_file_knows(tmp_path):
+    """A shaft of a data sheet is shown in rpm and degrees, with rounded numbers; the address keeps other choices."""
+    (tmp_path / "page.html").write_text(stored_atlas(SHAFT).explore().text)
+    told = texts(tmp_path / "page.html")
+    assert told["state"]["units"] == {"angle": "deg", "speed": "rpm", "J": 2, "k": 6e4}
+    assert (
+        "angle = 12 deg" in told["fixed"]
+        and "k2 = 40000 N m/rad" in told["fixed"]
+        and "J=" not in told["state"]["hash"]
+    )
+    other = texts(tmp_path / "page.html", "angle=rad&speed=1&J=3")["state"]
+    assert other["units"] == {"angle": "rad", "speed": "1", "J": 3, "k": 6e4}
+    assert {"angle=rad", "speed=1", "J=3"} <= set(other["hash"].split("&"))
 
 
 @needs_node

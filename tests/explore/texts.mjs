@@ -15,6 +15,7 @@ const image = pixels(grid, "verdict", THEMES.light), growth = pixels(grid, "grow
 const label = '<script>alert("x")</script>', axis = { factor: 1, lower: 0, upper: 1, label };
 const list = marks({ axes: [axis, axis], segments: [0, 0, 1, 1], lines: [], bands: [], curve: null }, 600, 400, "light");
 process.stdout.write(JSON.stringify({
+  fixed: Object.values(atlas.fixed).map(({ shown }) => shown),
   state: { ...state, hash: toHash(atlas, state) },
   scene: sceneText(atlas, { axes: state.axes, values, lower: state.lower, upper: state.upper }, 5),
   command: commandText(atlas, values),
