@@ -21,11 +21,11 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.atlas.interpolation import coefficients, evaluate, tensor_nodes
 from drivetrain_jax.atlas.panels import Atlas, Panel, to_arrays
-from drivetrain_jax.runs.physical import GivenData, in_parameters
 from drivetrain_jax.systems import Coordinate, FloquetModel, System
 
 if TYPE_CHECKING:
     from drivetrain_jax.runs.atlas_file import StoredAtlas
+    from drivetrain_jax.runs.physical import GivenData
 
 __all__ = ["Page", "explore"]
 
@@ -58,7 +58,7 @@ def pack(stored: StoredAtlas) -> dict[str, Any]:
     """
     scene, stability = stored.scene, stored.stability
     atlas, system = stability.atlas, scene.system
-    form, shaft = stability.form, in_parameters(system, {}, scene.data)[0]
+    form, shaft = stability.form, stored.shaft
     if form.reversal is not None:
         raise InputError(
             f"system = {system.name!r}: reverses time by matrices; allowed is a constant reversor, or none"

@@ -171,10 +171,7 @@ def _atlas_answers(
 
 def _shown(atlas: StoredAtlas, drawn: xr.Dataset, name: str, value: float) -> tuple[str, float, str]:
     """A value of a parameter in the units of the report, as physical data where the atlas has these."""
-    from drivetrain_jax.runs.physical import in_parameters
-
-    data = in_parameters(atlas.scene.system, {}, atlas.scene.data)[0]
-    quantity = data.quantity(name, value) if data else None
+    quantity = atlas.shaft.quantity(name, value) if atlas.shaft else None
     name, value, units = quantity or (name, value, atlas.scene.system.parameter(name).units)
     size, units = unit_of(drawn, name, units)
     return name, value * size, units

@@ -23,7 +23,7 @@ from drivetrain_jax.atlas.floquet import floquet_domain, smoothness
 from drivetrain_jax.runs.assemble import ResultBuffer, labelled, result_attrs, to_dataset
 from drivetrain_jax.runs.axes import Axis, in_unit
 from drivetrain_jax.runs.job import Job
-from drivetrain_jax.runs.physical import in_parameters
+from drivetrain_jax.runs.physical import GivenData, in_parameters
 from drivetrain_jax.runs.reuse import ReusedPoints
 from drivetrain_jax.runs.scene import Scene, atlas_ranges, restore_scene
 from drivetrain_jax.runs.through_atlas import build_atlas, evaluate
@@ -236,6 +236,11 @@ class StoredAtlas:
     def fixed(self) -> Mapping[str, Any]:
         """Values of the fixed parameters."""
         return self.stability.atlas.fixed
+
+    @property
+    def shaft(self) -> GivenData | None:
+        """The physical data of the scene, None without any."""
+        return in_parameters(self.scene.system, {}, self.scene.data)[0]
 
     def allowed(self, name: str) -> str:
         """The range of a parameter as text: ``0 <= beta <= 1.5, in rad``."""
