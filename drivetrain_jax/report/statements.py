@@ -18,7 +18,9 @@ from drivetrain_jax.resonances import FREQUENCIES, operating_range, stored_order
 from drivetrain_jax.view.charts import growth_of, role
 from drivetrain_jax.view.style import (
     ASKED,
+    MOST_RANGES,
     in_brackets,
+    ranges_text,
     scene_key,
     suitable,
     unit_of,
@@ -30,8 +32,6 @@ from drivetrain_jax.view.style import (
 if TYPE_CHECKING:
     from drivetrain_jax.runs.reply import Limit
 
-# Largest number of intervals and of labels that a statement lists.
-_MOST = 8
 # Results that judge the numerics or number something, so that their extremes say nothing.
 _PLAIN = ("_error", "_residual", "_number", "_certified")
 # A result of so few points is also shown as a table of all its values.
@@ -85,7 +85,7 @@ def _about_codes(dataset: xr.Dataset, variable: xr.DataArray, ranges: bool) -> I
         if 0 < shares[word] < 1 and bool(everywhere.any()):
             names = " and ".join(scene_key(dataset[dim]) if dim in dataset.coords else str(dim) for dim in others)
             where = f"for all values of {names} " if others else ""
-            yield f"{_capital(word)} {where}at {_ranges(axis, everywhere.values)}."
+            yield f"{_capital(word)} {where}at {ranges_text(axis, everywhere.values)}."
 
 
 def _main_axis(dataset: xr.Dataset, variable: xr.DataArray) -> xr.DataArray | None:
@@ -96,19 +96,10 @@ def _main_axis(dataset: xr.Dataset, variable: xr.DataArray) -> xr.DataArray | No
     return next((a for a in axes if a.name in along or scene_key(a) == speed), axes[0] if len(axes) == 1 else None)
 
 
-def _ranges(axis: xr.DataArray, holds: np.ndarray) -> str:
-    """The runs of sampled values of ``axis`` at which ``holds`` is true."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], holds.astype(np.int8), [0]))))
-    runs = [(axis.values[a], axis.values[b - 1]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-    shown = [digits(a) if a == b else f"{digits(a)} to {digits(b)}" for a, b in runs[:_MOST]]
-    more = f" and {len(runs) - _MOST} more ranges" if len(runs) > _MOST else ""
-    return f"{scene_key(axis)} = {', '.join(shown)}{more}{_unit(axis)}"
-
-
 def _about_numbers(dataset: xr.Dataset, variable: xr.DataArray) -> Iterator[str]:
     """Smallest and largest value with their places; by label if the analysis adds a short dimension."""
     own = [dim for dim in variable.dims if dim not in dataset["outcome"].dims]
-    if len(own) > 1 or (own and variable.sizes[own[0]] > _MOST):
+    if len(own) > 1 or (own and variable.sizes[own[0]] > MOST_RANGES):
         return
     if dataset["outcome"].size == 1:
         values = ", ".join(map(digits, np.atleast_1d(variable.values).ravel()))
@@ -172,7 +163,7 @@ def _about_limit(dataset: xr.Dataset, limit: Limit) -> Iterator[str]:
         axis = _main_axis(dataset, dataset["outcome"])
         inside = within.all([d for d in within.dims if axis is None or d != axis.name])
         kept = "nowhere" if not bool(within.any()) else f"at {_share(float(within.mean()))} of the points"
-        kept = f"at {_ranges(axis, inside.values)}" if axis is not None and bool(inside.any()) else kept
+        kept = f"at {ranges_text(axis, inside.values)}" if axis is not None and bool(inside.any()) else kept
         # A point without a value is not within the limit.
         side = "above" if found[place] > limit.value else "within"
         yield f"{name}: up to {most}, {side} the limit of {allowed}; within it {kept}."
@@ -216,8 +207,8 @@ def _about_orders(dataset: xr.Dataset) -> Iterator[str]:
         return
     for order, column in zip(orders.per_turn, speeds.T, strict=True):
         met = [f"{speed:.6g}" for speed in column[np.isfinite(column)]]
-        more = f" and {len(met) - _MOST} more speeds" if len(met) > _MOST else ""
-        yield f"{_capital(order)} meets modes at {', '.join(met[:_MOST])}{more} {unit} of the {orders.shaft}."
+        more = f" and {len(met) - MOST_RANGES} more speeds" if len(met) > MOST_RANGES else ""
+        yield f"{_capital(order)} meets modes at {', '.join(met[:MOST_RANGES])}{more} {unit} of the {orders.shaft}."
 
 
 def _place(dataset: xr.Dataset, variable: xr.DataArray, place: tuple[Any, ...]) -> str:

@@ -33,6 +33,7 @@ from drivetrain_jax.runs.reply import (
     limit_line,
     radius_gradient,
     radius_sensitivities,
+    verdict_words,
 )
 
 # Distance of a spectral radius from 1 below which the distance itself is printed.
@@ -269,10 +270,7 @@ def _point_sentence(
     """Verdict, growth and the nearest change of stability along the speed (or the first parameter), in one sentence."""
     if verdict is None:
         return ""
-    words = (
-        [verdict.capitalize()] if verdict != "undecided" else ["Undecided: the spectral radius is 1 within its error"]
-    )
-    words += [line.strip() for line in growth_lines(grows, width=0, sign="")]
+    words = verdict_words(verdict, grows)
     speed = asked.atlas.scene.system.roles.get("speed")
     changes = [(each, c) for each in nearest for c in (each.below, each.above) if c]
     along = [(each, c) for each, c in changes if each.parameter == speed] or [

@@ -19,7 +19,7 @@ from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.physical import described, read_table
-from drivetrain_jax.runs.reply import Limit, Reply, growth_lines, growth_of, speed_in_rpm
+from drivetrain_jax.runs.reply import Limit, Reply, growth_lines, growth_of, speed_in_rpm, verdict_words
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import Scene, load_scene, system_and_analysis
 
@@ -308,6 +308,11 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
     model = scene.analysis.model(scene.system)
     # The sentence needs all results.
     says = model.says if outcome.has_value and all(v.name in values for v in model.results) else None
+    grows = growth_of(scene.system, ordered, values, speed_in_rpm(scene.system, physical))
+    sentence = says(values, ordered) if says else ""
+    if "verdict" in values and outcome.has_value:
+        word = scene.analysis.variable("verdict").flags[int(values["verdict"])]
+        sentence = f"{'; '.join(verdict_words(word, grows, scene.analysis.name == 'floquet'))}."
     return PointResult(
         system=scene.system.name,
         analysis=scene.analysis.name,
@@ -321,9 +326,9 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
         physical=physical,
         remedy=scene.analysis.remedy(scene.request),
         advice=scene.analysis.advice(scene.request),
-        growth=growth_of(scene.system, ordered, values, speed_in_rpm(scene.system, physical)),
+        growth=grows,
         orders=order_crossings(scene, ordered, values),
-        sentence=says(values, ordered) if says else "",
+        sentence=sentence,
     )
 
 

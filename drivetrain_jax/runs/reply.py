@@ -160,6 +160,13 @@ def growth_lines(found: Mapping[str, float], width: int = 24, sign: str = "= ") 
     ]
 
 
+def verdict_words(verdict: str, grows: Mapping[str, float], radius: bool = True) -> list[str]:
+    """The meaning of a verdict (by the spectral ``radius``) and the growth, as parts of a sentence."""
+    word = verdict.replace("_", " ").capitalize()
+    word += ": the spectral radius is 1 within its error" if radius and verdict == "undecided" else ""
+    return [word, *(line.strip() for line in growth_lines(grows, width=0, sign=""))]
+
+
 # Relative step of central differences of the conversions of physical data, and step at 0. Part of the largest effect below
 # which an effect is rounding.
 _STEP, _ROUNDING = 1e-5, 1e-9

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import textwrap
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -23,7 +24,7 @@ from matplotlib.ticker import MaxNLocator
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.view import overlays
-from drivetrain_jax.view.sheet import Sheet, cell_edges, fit_axis, is_logarithmic, plain_decades, widen
+from drivetrain_jax.view.sheet import LETTERS, Sheet, cell_edges, fit_axis, is_logarithmic, plain_decades, widen
 from drivetrain_jax.view.style import (
     FAILED_COLOUR,
     FLAG_COLOURS,
@@ -35,6 +36,7 @@ from drivetrain_jax.view.style import (
     coordinate_text,
     in_brackets,
     power_of_ten,
+    ranges_text,
     scene_key,
     size,
     suitable,
@@ -573,7 +575,20 @@ def stack(
         codes = valid(dataset, name) if (name := _flagged(dataset)) else computed(dataset)
         for (axes,) in sheet.axes if codes.ndim == 1 and codes.any() else ():
             sheet.add(*draw_flags(axes, codes, along))
+        if name and codes.ndim == 1:
+            above = 24 if overlays.predictions(dataset, along) else 4
+            sheet.axes[0, 0].set_title(_sentence(codes, dataset[along]), loc="left", pad=above)
     return sheet
+
+
+def _sentence(codes: xr.DataArray, axis: xr.DataArray) -> str:
+    """The values of ``axis`` at which flags of :func:`valid` other than the most frequent one occur."""
+    names = [flag.replace("_", " ") for flag in (*flags(codes), FAILED, PENDING)]
+    counts = np.bincount(codes.values.astype(int), minlength=len(names))
+    most = int(counts.argmax())
+    words = [f"{n} at {ranges_text(axis, codes.values == k)}" for k, n in enumerate(names) if counts[k] and k != most]
+    text = "; ".join(words) or (f"{names[most]} throughout" if counts[most] == codes.size else "")
+    return textwrap.fill(f"{text[:1].upper()}{text[1:]}." if text else "", LETTERS)
 
 
 def fit_panels(sheet: Sheet, dataset: xr.Dataset, along: str) -> None:

@@ -24,7 +24,7 @@ _DPI, _NOTEBOOK_DPI = 200, 100
 # Mean width of a letter of a label, and height of the horizontal axis with its label, in inches.
 _LETTER, _FOOT = 0.068, 0.55
 # Letters in a line of the title, and in a line below the panels.
-_TITLE_LETTERS, _LETTERS = 80, 100
+_TITLE_LETTERS, LETTERS = 80, 100
 # The place in a paper at either end of a title: it says nothing to a reader without the paper.
 _PAPER = re.compile(r"[^:]*\b(?:Figs?\.?|Tables?|section) \d[^:]*: |, (?:Figs?\.?|Tables?) \d.*$")
 # Height of a colour bar below a panel, with its numbers and label, in inches.
@@ -106,7 +106,7 @@ class Sheet:
         title = figure.suptitle(text, x=0.01, ha="left", weight="bold", parse_math=False)
         # Lines end between parameters, not within one.
         about = re.sub(r"(?<![,;]) | (?=[^\[]*\])", "\u00a0", "; ".join(filter(None, (caption(dataset), note))))
-        about = textwrap.fill(about, _LETTERS, break_long_words=False, break_on_hyphens=False)
+        about = textwrap.fill(about, LETTERS, break_long_words=False, break_on_hyphens=False)
         look: dict[str, Any] = {
             "loc": "outside lower left",
             "alignment": "left",

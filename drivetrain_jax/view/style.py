@@ -72,6 +72,8 @@ _GREEK = {
     *("rho", "sigma", "tau", "phi", "chi", "psi", "omega", "Gamma", "Delta", "Theta", "Lambda", "Phi", "Psi", "Omega"),
 }
 
+# Largest number of ranges in a sentence.
+MOST_RANGES = 8
 # Largest length of a list in a caption.
 _MOST_ENTRIES = 6
 _PRODUCTS = {"EI": "$EI$", "rhoA": r"$\rho{}A$", "rhoI": r"$\rho{}I$", "kGA": r"$\kappa{}GA$"}
@@ -183,6 +185,16 @@ def power_of_ten(number: str) -> str:
 def coordinate_text(coordinate: xr.DataArray) -> str:
     """``symbol = value units`` of a scalar coordinate."""
     return value_text(scene_key(coordinate), coordinate.item(), coordinate.attrs.get("units", "1"))
+
+
+def ranges_text(axis: xr.DataArray, holds: np.ndarray) -> str:
+    """The runs of sampled values of ``axis`` at which ``holds`` is true: ``speed = 1425, 2275 to 2290 rpm``."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], holds.astype(np.int8), [0]))))
+    runs = [(axis.values[a], axis.values[b - 1]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    shown = [f"{a:.6g}" if a == b else f"{a:.6g} to {b:.6g}" for a, b in runs[:MOST_RANGES]]
+    more = f" and {len(runs) - MOST_RANGES} more ranges" if len(runs) > MOST_RANGES else ""
+    units = units_of(axis)
+    return f"{scene_key(axis)} = {', '.join(shown)}{more}{'' if units in ('1', '') else f' {units}'}"
 
 
 def caption(dataset: xr.Dataset) -> str:

@@ -58,6 +58,7 @@ def test_physical_units():
     exact = dt.point("cardan", "floquet", **dt.Cardan.from_physical(**data, speed=300.0, angle=18.0).values)
     assert found.parameters.items() <= exact.parameters.items() and found.spectral_radius == exact.spectral_radius
     assert json.loads(found.to_json())["physical"]["speed"] == {"value": 300.0, "units": "rpm"}
+    assert re.match(r"Stable; decay [\d.]+ 1/s, by a factor 0\.\d+ per turn; halves in ", repr(found))
     assert "from J1 = 2 kg m2, " in repr(found) and "physical" not in json.loads(exact.to_json())
     for given, message in (
         ({"J1": 2.0, "speed": 300.0}, "k1: missing; Omega = speed sqrt(J1/k1) needs k1"),

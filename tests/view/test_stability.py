@@ -45,6 +45,19 @@ def test_the_system_says_which_parameter_is_its_speed(order):
     assert offsets[:, 0].max() == 1.5 and offsets[:, 1].max() == 1.0
 
 
+def test_a_figure_over_one_axis_begins_with_its_ranges():
+    """The smallest angle has two undecided cells, the next one a failed cell."""
+
+    def above(beta):
+        return plot(results.chart().isel(beta=beta)).axes[0].get_title(loc="left")
+
+    speeds = results.chart().Omega.values
+    inside = speeds[results.unstable(0.5, speeds)]
+    assert above(10) == f"Unstable at Omega = {inside[0]:.6g} to {inside[-1]:.6g}."
+    assert above(0) == "Undecided at Omega = 0.5 to 0.525."
+    assert above(2) == "Stable throughout." and above(1) == "Failed at Omega = 0.5."
+
+
 def test_growth_map_shows_the_logarithm_and_masks_failed_cells():
     growth = meshes(plot(results.chart()))[1].get_array()
     assert np.ma.getmaskarray(growth)[1, 0]
