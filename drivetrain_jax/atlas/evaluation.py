@@ -1,7 +1,8 @@
-"""Values of an atlas at scattered points, by matrix products panel by panel.
+"""A grid cut into tiles, each within one panel: the factors whose products are the values of the atlas there.
 
-Shapes are fixed, so that one compiled kernel serves all panels: blocks of points are padded, and so are the degrees of
-smaller panels (with coefficients 0). The lanes are the last axis of every array.
+If cells are dense along the last axis, the needed functions of Phi are smooth over many cells. A tile is then evaluated
+only at ``NODES`` Chebyshev nodes, and ``spread`` interpolates to the cells. Shapes are fixed, so that one compiled kernel
+serves all tiles of a chart: tiles are padded, and so are the degrees of smaller panels (with coefficients 0).
 """
 
 from __future__ import annotations
@@ -17,82 +18,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
-from drivetrain_jax.atlas.panels import Atlas, Panel, between, chebyshev, position, position_between
-
-# Upper limit of the size of the first product of a block of scattered points.
-_WORKING_SET = 1 << 22
-# Points of a line that are evaluated at a time, and mean number of points per line above which lines save time.
-_LINE, _SHARED = 1 << 10, 2
-
-
-def scattered(tensor: Array, weights: Sequence[Array]) -> Array:
-    """Values ``(m, N)`` from ``tensor`` ``(n_1, m, n_2, ..., n_d)`` and T_j of each coordinate, ``(n_k, N)``."""
-    n, m, *rest = tensor.shape
-    values = (tensor.reshape(n, -1).T @ weights[0]).reshape(m, *rest, -1)
-    for w in reversed(weights[1:]):
-        values = jnp.sum(values * w, axis=-2)
-    return values
-
-
-def on_lines(panel: Panel, x: np.ndarray) -> np.ndarray:
-    """Values ``(m, N)`` at points in coordinates ``(N, d)``, many of which share all coordinates but the last two.
-
-    The tensor of the last two coordinates is made once for each combination of the others.
-    """
-    t, d = position(panel, x), x.shape[1]
-    values = np.empty((panel.coefficients.shape[-1], len(x)))
-
-    def fill(coefficients: np.ndarray, chosen: np.ndarray, k: int) -> None:
-        if k < d - 2:
-            for place in np.unique(t[chosen, k]):
-                reduced = np.tensordot(chebyshev(place, len(coefficients)), coefficients, axes=(0, 0))
-                fill(reduced, chosen[t[chosen, k] == place], k + 1)
-            return
-        first, second = coefficients.shape[:2]
-        for part in np.array_split(chosen, -(-len(chosen) // _LINE)):
-            rows = chebyshev(t[part, k], first) @ coefficients.reshape(first, -1)
-            values[:, part] = np.einsum(
-                "pnm,pn->mp", rows.reshape(len(part), second, -1), chebyshev(t[part, -1], second)
-            )
-
-    fill(panel.coefficients, np.arange(len(x)), 0)
-    return values
-
-
-def share_lines(x: np.ndarray) -> bool:
-    """True if on average at least ``_SHARED`` of the points ``x`` share all coordinates but the last two."""
-    return x.shape[1] > 2 and _SHARED * len(np.unique(x[:, :-2], axis=0)) <= len(x)
-
-
-def block_size(atlas: Atlas) -> int:
-    """Number of scattered points to evaluate at a time."""
-    rest = max((int(np.prod(p.coefficients.shape[1:])) for p in atlas.panels), default=1)
-    return int(2 ** np.clip(np.floor(np.log2(_WORKING_SET / rest)), 6, 10))
-
-
-def common_degrees(panels: Sequence[Panel]) -> tuple[int, ...]:
-    """The largest degrees among ``panels``."""
-    return tuple(np.max([p.degrees for p in panels], axis=0))
-
-
-def padded_tensor(panel: Panel, degrees: Sequence[int]) -> np.ndarray:
-    """Coefficients as ``(n_1, m, n_2, ..., n_d)``, padded with zeros to ``degrees``."""
-    fill = [(0, n - k) for n, k in zip(degrees, panel.degrees, strict=True)]
-    return np.ascontiguousarray(np.moveaxis(np.pad(panel.coefficients, [*fill, (0, 0)]), -1, 1))
-
-
-def point_weights(panel: Panel, x: np.ndarray, degrees: Sequence[int], size: int) -> list[np.ndarray]:
-    """``weights`` of :func:`scattered` for points in coordinates ``(N, d)``, padded to ``size`` with the last one."""
-    t = np.pad(position(panel, x), ((0, size - len(x)), (0, 0)), mode="edge")
-    return [np.ascontiguousarray(chebyshev(t[:, k], n).T) for k, n in enumerate(degrees)]
-
-
-# A grid cut into tiles, each within one panel: the factors whose products are the values of the atlas there.
-#
-# If cells are dense along the last axis, the needed functions of Phi are smooth over many cells. A tile is then evaluated
-# only at ``NODES`` Chebyshev nodes, and ``spread`` interpolates to the cells. Shapes are fixed, so that one compiled kernel
-# serves all tiles of a chart: tiles are padded, and so are the degrees of smaller panels (with coefficients 0).
-
+from drivetrain_jax.atlas.panels import Atlas, Panel, between, chebyshev, position_between
 
 # Nodes of a dense tile, and its largest angle arccos(t) times the degree of its panel. The highest polynomial runs through
 # 5.5 rad to either side of the middle, where the 24th coefficient of an oscillation is 1e-13; the relevant ones run through
@@ -146,7 +72,7 @@ def tiles(
     """
     if not atlas.panels:
         return
-    degrees = common_degrees(atlas.panels)[-2:]
+    degrees = np.max([panel.degrees for panel in atlas.panels], axis=0)[-2:]
     # An even number of rows of tiles, so two cores finish at the same time.
     shape = _shared(rows or len(axes[-2]), most[0], 8, 2), _width(atlas, axes[-1], most[1], dense)
     assigned = list(_assigned(atlas, axes))
@@ -155,13 +81,19 @@ def tiles(
         bands = _kinds_first(list(_bands(panel, axes[-1], groups[-1], degrees[1], shape[1], dense)))
         rows, places, total = _stacked(axes, len(groups[-2]), largest, shape)
         for fixed, reduced in _runs(_reductions(panel, axes, groups[:-2]), places):
-            tensors = filled_up(np.stack([padded_tensor(each, degrees) for each in reduced]), places)
+            tensors = filled_up(np.stack([_padded(each, degrees) for each in reduced]), places)
             for start in range(0, len(groups[-2]), rows):
                 chosen = groups[-2][start : start + rows]
                 weights = filled_up(chebyshev(_positions(panel, -2, axes[-2][chosen]), degrees[0]), rows)
                 first = _first_product(weights, tensors, total)
                 for band in bands:
                     yield Tile(panel, (*fixed, chosen, band.chosen), first, rows, band.columns, band.spread)
+
+
+def _padded(panel: Panel, degrees: Sequence[int]) -> np.ndarray:
+    """Coefficients as ``(n_1, m, n_2, ..., n_d)``, padded with zeros to ``degrees``."""
+    fill = [(0, n - k) for n, k in zip(degrees, panel.degrees, strict=True)]
+    return np.ascontiguousarray(np.moveaxis(np.pad(panel.coefficients, [*fill, (0, 0)]), -1, 1))
 
 
 def _stacked(axes: Sequence[np.ndarray], count: int, largest: int, shape: tuple[int, int]) -> tuple[int, int, int]:

@@ -9,9 +9,11 @@ import numpy as np
 
 from drivetrain_jax.atlas.panels import chebyshev
 
-# Most numbers in the first product of a block of points. Size of a product below which OpenBLAS starts no threads; these
-# would spin for a tenth of a second on cores that solves and charts need.
-_WORKING_SET, _ONE_THREAD = 1 << 22, 1 << 18
+# Numbers in the first product of a block of points, which fit into the cache, and fewest points of a block. Size of a
+# product below which OpenBLAS starts no threads; these would spin for a tenth of a second on cores that solves need.
+_WORKING_SET, _LEAST, _ONE_THREAD = 1 << 17, 32, 1 << 18
+# Mean number of points on a line above which points are evaluated line by line.
+_SHARED = 4
 
 
 def nodes(n: int) -> np.ndarray:
@@ -52,19 +54,25 @@ def coefficients(values: np.ndarray, degrees: Sequence[int]) -> np.ndarray:
 
 
 def evaluate(tensor: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Values ``(N, m)`` at points ``(N, d)`` in [-1, 1]^d."""
+    """Values ``(N, m)`` at points ``(N, d)`` in [-1, 1]^d; points that share their first coordinate share its products."""
     out = np.empty((len(x), tensor.shape[-1]))
-    first = tensor.reshape(tensor.shape[0], -1)
-    block = max(_WORKING_SET // first.shape[1], 1)
+    first, rest = tensor.reshape(len(tensor), -1), tensor.shape[1:]
+    block = max(_WORKING_SET // first.shape[1], _LEAST)
+    lines, own = np.unique(x[:, 0], return_inverse=True)
+    if x.shape[1] > 1 and 0 < _SHARED * len(lines) <= len(x):
+        chosen = np.split(np.argsort(own, kind="stable"), np.cumsum(np.bincount(own))[:-1])
+        for k, mine in enumerate(chosen):
+            row = _product(chebyshev(lines[k : k + 1], len(tensor)), first)
+            out[mine] = evaluate(row.reshape(rest), x[mine, 1:])
+        return out
     for start in range(0, len(x), block):
         part = x[start : start + block]
         # The first contraction is one matrix product; the others act on each point's remainder.
-        rest = _product(chebyshev(part[:, 0], tensor.shape[0]), first)
+        rows = _product(chebyshev(part[:, 0], len(tensor)), first)
         for k in range(1, x.shape[1]):
-            rest = np.einsum(
-                "pn,pnr->pr", chebyshev(part[:, k], tensor.shape[k]), rest.reshape(len(part), tensor.shape[k], -1)
-            )
-        out[start : start + block] = rest
+            n = tensor.shape[k]
+            rows = np.einsum("pn,pnr->pr", chebyshev(part[:, k], n), rows.reshape(len(part), n, -1))
+        out[start : start + block] = rows
     return out
 
 

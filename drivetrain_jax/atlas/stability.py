@@ -26,15 +26,18 @@ from drivetrain_jax.analysis.floquet.multipliers import characteristic_polynomia
 from drivetrain_jax.analysis.floquet.results import VARIABLES, results
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
-from drivetrain_jax.atlas import charts, evaluation
+from drivetrain_jax.atlas import charts
 from drivetrain_jax.atlas.charts import Build
 from drivetrain_jax.atlas.evaluation import Tile, tiles
-from drivetrain_jax.atlas.panels import Atlas
+from drivetrain_jax.atlas.interpolation import evaluate
+from drivetrain_jax.atlas.panels import Atlas, position
 from drivetrain_jax.atlas.points import LANES, Expansion, evaluated_cells, point_kernel
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
 DEFAULT_OUTPUTS = ("spectral_radius", "spectral_radius_error", "verdict")
 _FAST = frozenset(DEFAULT_OUTPUTS)
+# Points per call of the kernel of eigenvalues.
+_BLOCK = 1024
 # Held during a call: a kernel requested while another thread compiles it would be compiled twice.
 _JUDGING = Lock()
 
@@ -85,28 +88,16 @@ class StabilityAtlas:
     def by_eigenvalues(self, points: np.ndarray, outputs: Sequence[str]) -> dict[str, np.ndarray]:
         """As :meth:`at`, but all points by the eigenvalues of Z."""
         x, found = self.atlas.to_coordinates(points), self.blank((len(points),), outputs)
-        number, size = self.atlas.find(x), evaluation.block_size(self.atlas)
-        for k in range(len(self.atlas.panels)):
+        number = self.atlas.find(x)
+        for k, panel in enumerate(self.atlas.panels):
             mine = np.flatnonzero(number == k)
-            if not mine.size:
-                continue
-            phi = self._phi(k, x[mine], size)
-            for start in range(0, len(mine), size):
-                part = mine[start : start + size]
-                for name, value in self._exact_results(
-                    k, points[part], phi[:, start : start + size], tuple(outputs)
-                ).items():
+            phi = evaluate(panel.coefficients, position(panel, x[mine])).T
+            for start in range(0, len(mine), _BLOCK):
+                part, lanes = mine[start : start + _BLOCK], phi[:, start : start + _BLOCK]
+                lanes = np.pad(lanes, ((0, 0), (0, _BLOCK - len(part))), mode="edge")
+                for name, value in self._exact_results(k, points[part], lanes, tuple(outputs)).items():
                     found[name][part] = value[: len(part)]
         return found
-
-    def _phi(self, number: int, x: np.ndarray, size: int) -> np.ndarray:
-        """Values ``(m, N)`` of a panel at points in coordinates, filled up to a multiple of ``size``."""
-        panel = self.atlas.panels[number]
-        if evaluation.share_lines(x):
-            return np.pad(evaluation.on_lines(panel, x), ((0, 0), (0, -len(x) % size)), mode="edge")
-        degrees = evaluation.common_degrees(self.atlas.panels)
-        weights = (evaluation.point_weights(panel, x[i : i + size], degrees, size) for i in range(0, len(x), size))
-        return np.concatenate([_scattered(self._tensors[number], each) for each in weights], axis=1)
 
     def blank(self, shape: tuple[int, ...], outputs: Sequence[str] = DEFAULT_OUTPUTS) -> dict[str, np.ndarray]:
         """Results by name, and ``outcome``, of unknown points."""
@@ -169,12 +160,6 @@ class StabilityAtlas:
     @cached_property
     def _expansion(self) -> Expansion:
         return Expansion(self.atlas)
-
-    @cached_property
-    def _tensors(self) -> list[Array]:
-        """Coefficients of the panels in the layout of the kernels, converted once."""
-        degrees = evaluation.common_degrees(self.atlas.panels)
-        return [jnp.asarray(evaluation.padded_tensor(panel, degrees)) for panel in self.atlas.panels]
 
     @cached_property
     def form(self) -> LinearPeriodic:
@@ -248,9 +233,6 @@ def _store(found: Mapping[str, np.ndarray], tile: Tile, cells: charts.Cells) -> 
     first = [i[0] for i in tile.index]
     leading = np.broadcast_to(np.array(first[:-own], int), (len(unsure), len(first) - own))
     return np.concatenate([leading, unsure + first[-own:]], axis=1)
-
-
-_scattered = jax.jit(evaluation.scattered, compiler_options=compiler_options())
 
 
 @lru_cache(maxsize=16)

@@ -97,6 +97,22 @@ def test_one_three_and_four_parameters():
             assert np.abs(values(slice_, rest)[0] - values(atlas, points)[0]).max() < 1e-13
 
 
+@pytest.mark.parametrize("d", [1, 2, 3])
+def test_points_of_a_grid_have_the_values_of_single_points(d):
+    """Points that share coordinates share products; the order of the points does not matter."""
+    random = np.random.default_rng(d)
+    tensor = random.normal(size=(*(5, 4, 6)[:d], 3))
+    grid = np.stack(np.meshgrid(*[random.uniform(-1, 1, 9)] * d, indexing="ij"), axis=-1).reshape(-1, d)
+    x = random.permutation(grid)
+    alone = np.concatenate([evaluate(tensor, point[None]) for point in x])
+    assert evaluate(tensor, x) == pytest.approx(alone, abs=1e-13)
+    expected = sum(
+        tensor[k] * np.prod([np.cos(j * np.arccos(t)) for j, t in zip(k, x[0], strict=True)])
+        for k in np.ndindex(tensor.shape[:-1])
+    )
+    assert alone[0] == pytest.approx(expected, abs=1e-13)
+
+
 def test_oscillation_beyond_the_node_limit_is_split():
     def fast(p):
         return np.cos(120 * p)

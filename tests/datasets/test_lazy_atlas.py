@@ -14,8 +14,7 @@ import pytest
 import xarray as xr
 
 import drivetrain_jax as dt
-from drivetrain_jax.atlas import charts, evaluation, interpolation
-from drivetrain_jax.atlas.panels import position
+from drivetrain_jax.atlas import charts
 from drivetrain_jax.datasets.engine import gap
 from drivetrain_jax.runs import through_atlas
 from drivetrain_jax.runs.atlas_file import StoredAtlas
@@ -167,15 +166,14 @@ def test_chunks_of_even_axes_reach_along_those_of_low_degree(deep):
 @pytest.mark.full
 def test_many_small_rectangles_are_evaluated_together(deep, monkeypatch):
     """With the numbers of single points, also where eigenvalues decide."""
-    stability, calls, shared = dt.open_atlas(deep).stability, [], []
-    evaluated_tiles, on_lines = charts.evaluated_tiles, evaluation.on_lines
+    stability, calls = dt.open_atlas(deep).stability, []
+    evaluated_tiles = charts.evaluated_tiles
 
     def counting(tiles, *more):
         calls.append(tiles := list(tiles))
         return evaluated_tiles(iter(tiles), *more)
 
     monkeypatch.setattr(charts, "evaluated_tiles", counting)
-    monkeypatch.setattr(evaluation, "on_lines", lambda panel, x: shared.append(len(x)) or on_lines(panel, x))
     axes = [
         np.linspace(*ends, n) for ends, n in zip(((0.0, 0.6), (1.38, 1.46), (0.95, 1.05)), (20, 40, 33), strict=True)
     ]
@@ -190,15 +188,8 @@ def test_many_small_rectangles_are_evaluated_together(deep, monkeypatch):
     both = (found["verdict"].ravel() < 2) & (alone["verdict"] < 2)
     assert both.mean() > 0.99 and (found["verdict"].ravel() == alone["verdict"])[both].all()
     slow = stability.by_eigenvalues(points[-200:], ["spectral_radius", "spectral_radius_error"])
-    assert shared
     error = slow["spectral_radius_error"] + alone["spectral_radius_error"][-200:]
     assert (abs(slow["spectral_radius"] - alone["spectral_radius"][-200:]) <= error).all()
-    x = stability.atlas.to_coordinates(points[:2000])
-    inside = x[stability.atlas.find(x) == 0]
-    panel = stability.atlas.panels[0]
-    exact = interpolation.evaluate(panel.coefficients, position(panel, inside))
-    np.testing.assert_allclose(on_lines(panel, inside).T, exact, rtol=0, atol=1e-12 * abs(exact).max())
-    assert evaluation.share_lines(x) and not evaluation.share_lines(np.random.default_rng(0).random((50, 3)))
 
 
 def test_arrays_travel_without_what_they_hold(file, expected):
