@@ -43,7 +43,7 @@ _BOUNDS, _PART, _LEAST = 10.0, 1e-6, 1e-9
 # Points of a range at which a check solves, and points at which it searches the maximum on the surrogate.
 _SAMPLES, DENSE = 101, 801
 # Largest distance of direct solves from the unit circle that counts as on it.
-_ON_THE_CIRCLE = 1e-6
+ON_THE_CIRCLE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Check:
     @property
     def agrees(self) -> bool:
         """True if the direct solves confirm the answer."""
-        within = self.inside <= 1 + _ON_THE_CIRCLE if self.conservative else self.inside < 1
+        within = self.inside <= 1 + ON_THE_CIRCLE if self.conservative else self.inside < 1
         return within and not self.beyond <= 1
 
 

@@ -61,12 +61,12 @@ def is_proved(atlas: Atlas) -> bool:
     return not atlas.gaps and bool(np.isfinite([panel.proved_error for panel in atlas.panels]).all())
 
 
-def summary(proved: np.ndarray) -> str:
-    """The number of verdicts that are ``proved`` (flags), in one sentence without a full stop."""
+def summary(proved: np.ndarray, where: str) -> str:
+    """The number of verdicts that are ``proved`` (flags), ``where`` being what they belong to, as a part of a sentence."""
     total, count = np.size(proved), int(np.sum(proved))
     if not count:
-        return "verdicts are estimates, not proved"
-    return f"all {total:,} verdicts are proved" if count == total else f"{count:,} of {total:,} verdicts are proved"
+        return "verdicts hold by estimate, not by proof"
+    return f"the verdicts of {'all' if count == total else f'{count:,} of'} {total:,} {where} are proved"
 
 
 def proved_error(atlas: Atlas, panel: Panel, system: type[System]) -> float:
@@ -144,7 +144,9 @@ def _evaluated(panel: Panel, x: np.ndarray, wrong: np.ndarray) -> tuple[np.ndarr
     values = np.empty((len(x), 16))
     for start in range(0, len(x), _POINTS):
         at = t[start : start + _POINTS]
-        rest = chebvander(at[:, 0], panel.degrees[0] - 1) @ panel.coefficients.reshape(panel.degrees[0], -1)
+        # Cells of a chart share lines.
+        lines, own = np.unique(at[:, 0], return_inverse=True)
+        rest = (chebvander(lines, panel.degrees[0] - 1) @ panel.coefficients.reshape(panel.degrees[0], -1))[own]
         for k, n in enumerate(panel.degrees[1:], start=1):
             rest = np.einsum("pn,pnr->pr", chebvander(at[:, k], n - 1), rest.reshape(len(at), n, -1))
         values[start : start + _POINTS] = rest

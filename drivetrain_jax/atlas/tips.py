@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drivetrain_jax._errors import counted
 from drivetrain_jax.atlas.criteria import MINUS, PAIR, PLUS, Criteria, Growth, growth, limiting, parameters_at
 from drivetrain_jax.atlas.exclusion import Search, critical_points
 from drivetrain_jax.atlas.panels import Atlas
@@ -149,6 +150,19 @@ class Tips:
     tips: tuple[Tip, ...]
     undecided: tuple[Box, ...]
     searches: tuple[Search, ...] = ()
+
+    @property
+    def proof(self) -> str:
+        """What is certain of the tips, in one sentence."""
+        sure = sum(tip.proved for tip in self.tips)
+        more = f", and {len(self.tips) - sure} more may be tips" if sure < len(self.tips) else ""
+        hidden = (
+            f"; narrow unstable ranges may lie in {counted(len(self.undecided), 'box', 'boxes')}"
+            if self.undecided
+            else ""
+        )
+        certain = f"{counted(sure, 'tip is', 'tips are')} certain within the bounds of the atlas"
+        return f"{certain}, which are estimates{more}{hidden}."
 
 
 def find_tips(atlas: Atlas, system: type[System], *, opening: bool = True) -> Tips:

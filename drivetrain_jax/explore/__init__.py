@@ -76,6 +76,9 @@ def pack(stored: StoredAtlas) -> dict[str, Any]:
         },
         "units": _units(system, shaft),
         "rtol": stability.rtol,
+        "proof": "verdicts hold by estimate; drivetrain query says which are proved"
+        if any(np.isfinite(panel.proved_error) for panel in atlas.panels)
+        else "verdicts hold by estimate, not by proof",
         "size": form.size,
         "halves": form.halves,
         "reversor": None if form.reversor is None else np.ravel(form.reversor).tolist(),

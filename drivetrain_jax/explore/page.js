@@ -211,7 +211,7 @@ function drawing(app) {
 function buildControls(app) {
   const { atlas } = app, changeTo = (id, edit, whole = true) => get(id).addEventListener("change", () => app.change((state) => edit(state, get(id)), whole && "whole"));
   get("title").textContent = atlas.title || atlas.system.title;
-  get("about").textContent = [atlas.system.title, ...Object.values(atlas.fixed).map(({ shown }) => shown)].join(", ");
+  get("about").textContent = [atlas.system.title, ...Object.values(atlas.fixed).map(({ shown }) => shown)].join(", ") + `; ${atlas.proof}.`;
   for (const id of ["across", "up"]) get(id).append(...atlas.parameters.map((p, k) => new Option(app.caption(k), p.name)));
   const swap = (state, at, name) => {
     const k = atlas.parameters.findIndex((p) => p.name === name), other = state.axes.length - 1 - at;

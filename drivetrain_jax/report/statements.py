@@ -47,6 +47,7 @@ def statements(
     """
     coded = [v for v in _coded(dataset) if v.name != "outcome"]
     said = [sentence for variable in coded for sentence in _about_codes(dataset, variable, ranges)]
+    said += [f"{_capital(dataset.attrs['proof'])}."] if "proof" in dataset.attrs else []
     said += [*_about_growth(dataset), *(_about_limit(dataset if moved is None else moved, limit) if limit else ())]
     said += [sentence for variable in _numbers(dataset) for sentence in _about_numbers(dataset, variable)]
     return [*said, *_about_orders(dataset), *_about_outcome(dataset), *_about_errors(dataset)]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import OUTCOME, get_analysis
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
-from drivetrain_jax.atlas import design
+from drivetrain_jax.atlas import design, proof
 from drivetrain_jax.atlas.criteria import has_boundaries
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.windows import Crossing, Interval, narrow
@@ -85,6 +85,8 @@ class AtlasQuery:
     shaft: GivenData | None
     # Instead of the physical data of the question, if given.
     show: Show | None = None
+    # Flags of the points of direct solves whose verdict is proved.
+    checked: list[np.ndarray] = field(default_factory=list)
 
     @classmethod
     def of(
@@ -125,6 +127,21 @@ class AtlasQuery:
             if name not in free or name in own:
                 _check_range(seen, name, own.get(name), name in (*ranges, *within))
         return cls(atlas, own, shaft)
+
+    def direct(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Spectral radii by direct solves; the points whose verdict is proved are counted."""
+        radius = self.atlas.direct(columns)
+        # Without damping multipliers of stable points lie on the unit circle, up to rounding.
+        flags = [self.atlas.proved(columns, radius > 1 + margin) for margin in (0.0, design.ON_THE_CIRCLE)]
+        self.checked.append(np.any(flags, axis=0))
+        return radius
+
+    def proofs(self) -> list[str]:
+        """The number of checked points whose verdict is proved, as a line; empty without checks."""
+        if not self.checked:
+            return []
+        said = proof.summary(np.concatenate(self.checked), "points checked")
+        return [f"  {said}; between them they hold by estimate" if "proved" in said else f"  {said}"]
 
     def numbers(self) -> dict[str, float]:
         """The values that are numbers."""
@@ -229,7 +246,8 @@ def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None)
     variables = {v.name: v for v in (*atlas.scene.analysis.variables, OUTCOME)}
     proved = "verdict" in results and bool(atlas.proved(point, results["verdict"]))
     rows = _result_rows(atlas, results, variables)
-    rows += [f"  {'proved':<24} yes"] if proved else []
+    if VERDICTS[int(results.get("verdict", -1))] != "undecided":
+        rows.append(f"  {'proof':<24} the verdict {'is proved' if proved else 'holds by estimate, not by proof'}")
     slopes = radius_gradient(atlas.scene.system, {**atlas.fixed, **point})
     effects = None if slopes is None else radius_sensitivities(asked, slopes)
     panels, system = atlas.stability.atlas, atlas.scene.system
@@ -327,7 +345,7 @@ def _limit(
     speed, limited = roles_of(atlas, "speed", role)
     asked = replace(AtlasQuery.of(atlas, given, ranges=(speed,), free=(limited,)), show=show)
     panels, system = atlas.stability.atlas, atlas.scene.system
-    return asked, question(panels, system, asked.values[speed], asked.numbers(), direct=atlas.direct)
+    return asked, question(panels, system, asked.values[speed], asked.numbers(), direct=asked.direct)
 
 
 def speed_windows(
@@ -342,7 +360,7 @@ def speed_windows(
     asked = replace(AtlasQuery.of(atlas, given, ranges=(), free=(speed,), within=(speed,)), show=show)
     panels = atlas.stability.atlas
     part = narrow(panels, {speed: asked.values[speed]}) if speed in asked.values else panels
-    found = design.speed_windows(part, atlas.scene.system, asked.numbers(), margin=margin, direct=atlas.direct)
+    found = design.speed_windows(part, atlas.scene.system, asked.numbers(), margin=margin, direct=asked.direct)
     names = [_resonance(asked, speed, each) for each in found.unstable]
     compared, forced = forced_over(atlas, amplitude, [w.safe for w in found.windows], asked.numbers(), asked.named)
     lines, sensitivities = [f"safe speeds, {asked.heading()}, margin {margin:g}"], []
@@ -384,7 +402,7 @@ def speed_windows(
         **forced,
     }
     lines += [] if found.windows else [f"  none {_OPEN if found.undecided else 'within the atlas'}"]
-    lines += _undecided(asked, speed, found.undecided)
+    lines += [*_undecided(asked, speed, found.undecided), *asked.proofs()]
     return Reply(lines, data, _where_unstable(asked, part, speed, found, names))
 
 
@@ -508,7 +526,7 @@ def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: des
     if answer.check:
         lines += [] if answer.certain else ["  not certain: undecided ranges are wider than the errors"]
         lines.append(f"  {_checked(answer.check)}")
-    lines += _undecided(asked, name, answer.undecided)
+    lines += [*_undecided(asked, name, answer.undecided), *asked.proofs()]
     found = [] if answer.value is None else [asked.values[asked.atlas.scene.system.roles["speed"]]]
     compared, forced = forced_over(
         asked.atlas, amplitude, found, {**asked.numbers(), name: answer.value or 0.0}, asked.named

@@ -40,8 +40,10 @@ def chart(source: str | Path | xr.Dataset, part: Mapping[str, float | tuple[floa
     ``part`` fixes parameters (numbers) or restricts them (ranges). Any further parameter gets three values. The chart also
     has the stability boundaries (``boundary_NAME``, segments separated by NaN, for each value of the further parameters),
     if the system has them. A chart of two parameters has the tips of the tongues as well (``tip_NAME``, their names,
-    ``tip_NAME_error``, ``tip_opens``, ``tip_proved``), and boxes that may contain more tips (``undecided_NAME``). Raises
-    :class:`InputError` for values outside the atlas, :class:`ChunkError` if a direct solve in a gap fails.
+    ``tip_NAME_error``, ``tip_opens``, ``tip_proved``), and boxes that may contain more tips (``undecided_NAME``). Its
+    attribute ``proof`` says how many verdicts are proved.
+
+    Raises :class:`InputError` for values outside the atlas, :class:`ChunkError` if a direct solve in a gap fails.
     """
     if not isinstance(cells, (int, np.integer)) or isinstance(cells, bool) or not 2 <= cells <= 20_000:
         raise InputError(f"cells = {quoted(cells)}: allowed is a whole number, 2 <= cells <= 20000")
@@ -57,6 +59,12 @@ def chart(source: str | Path | xr.Dataset, part: Mapping[str, float | tuple[floa
         if name in shown
     }
     dataset = atlas.grid(**axes, **fixed)
+    if "verdict" in dataset:
+        said = atlas.proof(
+            {name: axes[name] for name in atlas.parameters if name in axes}, fixed, dataset["verdict"].values
+        )
+        curves = "; boundaries and tips hold by estimate" if len(shown) > 1 and "proved" in said else ""
+        dataset = dataset.assign_attrs(proof=said + curves)
     if len(shown) > 1 and has_boundaries(atlas.stability.atlas, atlas.scene.system):
         plane, slices = {n: ranges[n] for n in shown[:2]}, {n: axes[n] for n in axes if n not in shown[:2]}
         dataset = dataset.assign_coords(_stored_curves(atlas, fixed, plane, slices))

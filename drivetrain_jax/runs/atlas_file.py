@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -81,6 +82,8 @@ def broadcast(given: Mapping[str, Any]) -> tuple[xr.DataArray, ...]:
 
 # Values along each axis of the stored chart.
 _CELLS = 256
+# Most cells of a chart whose proofs are counted: a cell takes two microseconds.
+_TESTED = 250_000
 # Relative error of forced amplitudes, which are compared with a limit.
 _AMPLITUDE = 1e-6
 # Variables of the file: name, dimensions, meaning. Boxes are in the coordinates named by the attribute.
@@ -208,6 +211,11 @@ def _missing(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any]) -> list
     return missing
 
 
+def _meshed(axes: Mapping[str, np.ndarray], fixed: Mapping[str, float]) -> dict[str, Any]:
+    """The parameters of all points of a grid."""
+    return {**fixed, **dict(zip(axes, np.meshgrid(*axes.values(), indexing="ij"), strict=True))}
+
+
 @dataclass(frozen=True)
 class StoredAtlas:
     """A stability atlas as a function: ``atlas(beta=0.31, Omega=1.2)``.
@@ -329,11 +337,11 @@ class StoredAtlas:
             labels |= self.coordinates(name, column.values, column.dims)
         return xr.Dataset(data, labels, found.attrs)
 
-    def grid(self, **given: Any) -> xr.Dataset:
+    def grid(self, *, proved: bool = False, **given: Any) -> xr.Dataset:
         """Results on the outer product of arrays, as of a scene with these axes; a number fixes its parameter.
 
-        The dimensions have the order in which the arrays are given; a number is a coordinate without a dimension. Raises
-        the errors of a call.
+        The dimensions have the order in which the arrays are given; a number is a coordinate without a dimension.
+        ``proved`` adds the flags of a call, which take ten times as long as the results. Raises the errors of a call.
         """
         self, values = self.viewed(given), self.in_parameters(given)
         self._names(values)
@@ -349,7 +357,18 @@ class StoredAtlas:
             return self(**given)
         fixed = {name: float(column) for name, column in columns.items() if not column.ndim}
         part = self.slice(fixed)
-        return self.with_fixed(to_dataset(part.scene_on(axes), part.arrays(axes), {}), fixed)
+        found = to_dataset(part.scene_on(axes), part.arrays(axes), {})
+        if proved and "verdict" in found:
+            flags = self.proved(_meshed(axes, fixed), np.asarray(found["verdict"].values))
+            found["proved"] = (found["verdict"].dims, flags, PROVED)
+        return self.with_fixed(found, fixed)
+
+    def proof(self, axes: Mapping[str, np.ndarray], fixed: Mapping[str, float], verdict: np.ndarray) -> str:
+        """The number of proved verdicts of a chart, as a part of a sentence; of a large chart some cells are tested."""
+        step = math.ceil((verdict.size / _TESTED) ** (1 / verdict.ndim))
+        mesh = _meshed({name: axis[::step] for name, axis in axes.items()}, fixed)
+        flags = self.proved(mesh, verdict[(slice(None, None, step),) * verdict.ndim])
+        return proof.summary(flags, "cells tested" if step > 1 else "cells")
 
     def with_fixed(self, dataset: xr.Dataset, fixed: Mapping[str, float]) -> xr.Dataset:
         """``dataset`` with ``fixed`` parameters as coordinates."""

@@ -106,6 +106,7 @@ class Sheet:
         title = figure.suptitle(text, x=0.01, ha="left", weight="bold", parse_math=False)
         # Lines end between parameters, not within one.
         about = re.sub(r"(?<![,;]) | (?=[^\[]*\])", "\u00a0", "; ".join(filter(None, (caption(dataset), note))))
+        about = "; ".join(filter(None, (about, dataset.attrs.get("proof"))))
         about = textwrap.fill(about, LETTERS, break_long_words=False, break_on_hyphens=False)
         look: dict[str, Any] = {
             "loc": "outside lower left",

@@ -10,9 +10,14 @@ import pytest
 import xarray as xr
 
 import drivetrain_jax as dt
+from drivetrain_jax import view
 from drivetrain_jax.atlas import proof
+from drivetrain_jax.atlas.tips import find_tips
 from drivetrain_jax.cli import main
+from drivetrain_jax.report.statements import statements
 from drivetrain_jax.runs import atlas_file
+from drivetrain_jax.runs.atlas_answers import query, widest_angle
+from drivetrain_jax.runs.atlas_chart import chart
 
 BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
 AXES = {"beta": {"start": 0.0, "stop": 0.6}, "Omega": {"start": 1.2, "stop": 1.6}}
@@ -99,6 +104,26 @@ def test_nothing_is_said_to_be_proved_without_a_proof(tmp_path, capsys):
     assert "theorem" not in file.attrs and "proved_error" not in file
     assert printed(capsys, "query", out, "mu=1", "Omega=1.3", "--json")["proved"] is False
     assert main(["verify", str(out), "--proof"]) == 2 and "holds no proof" in capsys.readouterr().err
+
+
+def test_charts_reports_pages_tips_and_design_say_what_is_proved(path, monkeypatch):
+    monkeypatch.setattr(atlas_file, "_TESTED", 30)
+    drawn, all_cells = chart(path, {}, 8), "the verdicts of all 16 cells tested are proved; boundaries and tips hold by"
+    assert drawn.attrs["proof"].startswith(all_cells)
+    text = view.plot(drawn).legends[0].get_title().get_text()
+    assert all_cells in " ".join(text.split())
+    assert f"{all_cells.capitalize()} estimate." in statements(drawn)
+    atlas = dt.open_atlas(path)
+    flags = atlas.grid(Omega=np.linspace(1.2, 1.6, 3), beta=np.array([0.1, 0.3]), proved=True).proved
+    assert flags.dims == ("Omega", "beta") and flags.values.all()
+    assert "drivetrain query says which are proved" in atlas.explore().text
+    tips = find_tips(atlas.stability.atlas, atlas.scene.system)
+    assert tips.proof == "1 tip is certain within the bounds of the atlas, which are estimates."
+    answer = widest_angle(atlas, {"Omega": (1.3, 1.5)}).text
+    assert re.search(
+        "the verdicts of 1[0-9]+ of 105 points checked are proved; between them they hold by estimate", answer
+    )
+    assert "the verdict is proved" in query(atlas, {"beta": 0.3, "Omega": 1.3}).text
 
 
 def test_a_run_and_verify_say_why_nothing_is_proved(tmp_path, monkeypatch, capsys):
