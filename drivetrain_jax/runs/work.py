@@ -34,6 +34,8 @@ _CHUNKS_IN_FLIGHT = 8
 
 # Seconds until a scheduler has answered. A busy one may answer late.
 _ANSWERED = 10.0
+# Seconds after which a local cluster without workers gets new ones, how often, and seconds between two looks for results.
+_PATIENCE, _REPLACED, _POLL = 30.0, 2, 0.02
 _LOCAL = re.compile(r"local:([1-9]\d*)")
 # Loggers of Dask that report the death of a scheduler or worker; the run reports it in one line.
 _TALKATIVE = ("distributed", "tornado", "asyncio")
@@ -226,10 +228,30 @@ class Cluster(Threads):
                 finished.add(future)
             if not running:
                 return
+            self._keep_workers(finished)
             future = next(finished)
             block, results = running.pop(future.key), _result(distributed, future)
             future.release()
             yield block, results
+
+    def _keep_workers(self, finished: Any) -> None:
+        """Wait for a result. A local cluster without workers gets new ones: Dask restarts none that dies while it starts.
+
+        Raises :class:`ChunkError` if new ones die too.
+        """
+        cluster, replaced, since = self._client.cluster, 0, time.monotonic()
+        while cluster is not None and not finished.has_ready():
+            time.sleep(_POLL)
+            if time.monotonic() - since > _PATIENCE:
+                if not self._client.nthreads():
+                    if replaced == _REPLACED:
+                        raise ChunkError(
+                            "dask: local workers end as soon as they start; a run with threads may say why"
+                        )
+                    cluster.scale(0)
+                    cluster.scale(int(self._address.removeprefix("local:")))
+                    replaced += 1
+                since = time.monotonic()
 
     def close(self) -> None:
         """Disconnect, and end a local cluster."""
@@ -247,6 +269,7 @@ def _result(distributed: Any, future: Any) -> Results | None:
 
 
 def _connect(distributed: Any, address: str, stack: ExitStack) -> Any:
+    place: Any = address
     try:
         if local := _LOCAL.fullmatch(address):
             count = int(local.group(1))
@@ -258,8 +281,8 @@ def _connect(distributed: Any, address: str, stack: ExitStack) -> Any:
                 dashboard_address=None,
                 scheduler_kwargs={"dashboard_address": ":0"},
             )
-            address = stack.enter_context(cluster).scheduler_address
-        return stack.enter_context(distributed.Client(address, timeout=_ANSWERED, set_as_default=False))
+            place = stack.enter_context(cluster)
+        return stack.enter_context(distributed.Client(place, timeout=_ANSWERED, set_as_default=False))
     except RuntimeError as error:
         where = 'below the line `if __name__ == "__main__":` of the script, which each worker imports'
         raise InputError(f"workers: do not start ({error}); allowed is a call {where}") from None

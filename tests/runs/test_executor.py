@@ -18,6 +18,7 @@ import xarray as xr
 
 import drivetrain_jax as dt
 from drivetrain_jax import InputError
+from drivetrain_jax._errors import ChunkError
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.runs import toml, work
 from drivetrain_jax.runs.job import Block
@@ -194,3 +195,29 @@ def test_missing_blocks_are_an_error(grid_scene, monkeypatch):
     monkeypatch.setattr(Threads, "run", lambda *_: (block for block in ()))
     with pytest.raises(dt.Incomplete, match=r"^some blocks returned no result"):
         dt.run(grid_scene)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("system", ["planetary", "toy"])
+def test_a_local_cluster_without_workers_gets_new_ones(monkeypatch, system):
+    """Dask gives up workers that die while they start; here they do not know the toy."""
+    pytest.importorskip("distributed")
+    toy.names(monkeypatch.setattr)
+    monkeypatch.setattr(work, "_PATIENCE", 5.0)
+    analysis, fixed = ("modes", {}) if system == "planetary" else ("toy", {"a": 1.0})
+    job = resolve(load_scene({"system": system, "analysis": analysis, "fixed": fixed}))
+    cluster = work.make_executor(workers=1)
+    try:
+        cluster._client = work._connect(work._distributed(), "local:1", cluster._connection)
+        for nanny in cluster._client.cluster.workers.values():
+            cluster._client.cluster.sync(nanny.kill)
+        assert not cluster._client.nthreads()
+        blocks = cluster.run(job, job.blocks(), None, 0, lambda _: None)
+        if system == "toy":
+            with pytest.raises(ChunkError, match="end as soon as they start"):
+                next(blocks)
+        else:
+            ((_, results),) = blocks
+            assert (results["outcome"] == Outcome.SUCCESS).all()
+    finally:
+        cluster.close()
