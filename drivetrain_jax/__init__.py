@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from drivetrain_jax.runs.over import sweep
     from drivetrain_jax.runs.point import point
     from drivetrain_jax.runs.run import Incomplete, Interrupted, run
+    from drivetrain_jax.systems import register
     from drivetrain_jax.systems.bicardan import Bicardan
     from drivetrain_jax.systems.cardan import Cardan
     from drivetrain_jax.systems.driveline import Driveline
@@ -54,6 +55,7 @@ _HOME = {
     "runs.output": ("open_result",),
     "runs.point": ("point",),
     "runs.run": ("Incomplete", "Interrupted", "run"),
+    "systems": ("register",),
     "systems.bicardan": ("Bicardan",),
     "systems.cardan": ("Cardan",),
     "systems.driveline": ("Driveline",),
@@ -91,6 +93,7 @@ __all__ = [
     "plot",
     "poincare",
     "point",
+    "register",
     "run",
     "steady_state",
     "sweep",

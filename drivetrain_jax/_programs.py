@@ -101,7 +101,7 @@ def numerics_of(system: type[System], analysis: Analysis, route: str) -> dict[st
     """
     sources = dict(_own_sources())
     for package in _packages(system, analysis) - {drivetrain_jax.__name__}:
-        sources |= _sources_of(package)
+        sources |= _sources_of(package) or {package: _word_of(system)}
     return {
         "route": route,
         "sources": sources,
@@ -127,6 +127,12 @@ def _packages(system: type[System], analysis: Analysis) -> set[str]:
     """Names of the outermost packages, or of the scripts, that contain the code of a system and of an analysis."""
     code = (system, *(getattr(x, "func", x) for x in (analysis.model(system).build, analysis.solvers)))
     return {str(x.__module__).partition(".")[0] for x in code}
+
+
+@cache
+def _word_of(system: type[System]) -> str:
+    """A word for the code of a class without a file, as in a notebook: its results do not resume in another process."""
+    return secrets.token_hex(8)
 
 
 # Cached: later edits of the files do not change the imported code.

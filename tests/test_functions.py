@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
+from drivetrain_jax import systems
 from drivetrain_jax.analysis import OUTCOME, Outcome, get_analysis
 from drivetrain_jax.analysis._base import make_request
 from drivetrain_jax.analysis.floquet import propagator
@@ -23,7 +24,17 @@ from drivetrain_jax.runs import kernel
 from drivetrain_jax.runs.kernel import compile_kernel, result_variables
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
-from drivetrain_jax.systems import LinearPeriodic, Smoothness, System, get_system, parameter, serves
+from drivetrain_jax.systems import (
+    Component,
+    Flow,
+    LinearPeriodic,
+    Smoothness,
+    System,
+    Variable,
+    get_system,
+    parameter,
+    serves,
+)
 from tests.sizes import but_full
 
 BASE = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
@@ -301,6 +312,56 @@ def test_any_function_is_swept_resumed_and_refused(tmp_path):
     with pytest.raises(dt.InputError, match="system = 'function': known only to the script"):
         dt.sweep(dt.floquet, SHAFT, over={"beta": [0.1]}, out=out)
     assert dt.sweep(one(2.0), pytree, over=over, out=out, fresh=True).root[1, 1] == 12.0
+
+
+def test_registered_classes_are_known_by_name(tmp_path, monkeypatch):
+    """Until another one of this name replaces them; classes without a file, as in a notebook, do not share results."""
+    monkeypatch.setattr(systems, "_REGISTERED", {})
+
+    def made(factor):
+        class Own(System):
+            name, title = "own", "own"
+            a: float = parameter("1", "a")
+
+            @serves("parameters", results=(Variable("b", "1", "b"),))
+            def constants(self):
+                return {"b": factor * self.a}
+
+        Own.__module__ = "no_file"
+        return Own
+
+    scene, out = {"system": "own", "analysis": "parameters", "axes": {"a": [1.0, 2.0]}}, tmp_path / "own.nc"
+    with pytest.raises(dt.InputError, match="system = 'own': unknown"):
+        dt.run(scene)
+    assert dt.run(scene | {"system": made(2.0)}, out=out).b.values.tolist() == [2.0, 4.0]
+    assert dt.run(scene, out=out).b.values.tolist() == [2.0, 4.0]
+    dt.register(made(3.0))
+    assert dt.run(scene).b.values.tolist() == [3.0, 6.0]
+    with pytest.raises(dt.InputError, match=r"own\.nc"):
+        dt.run(scene, out=out)
+    assert dt.register(dt.Cardan) is dt.Cardan and not systems._REGISTERED.keys() - {"own"}
+    same = type("Same", (made(1.0),), {"name": "cardan"})
+    for wrong, message in (
+        (3, "system = 3: allowed is a subclass of"),
+        (same, "system = 'cardan': names an installed"),
+    ):
+        with pytest.raises(dt.InputError, match=message):
+            dt.register(wrong)
+
+
+def test_a_sweep_of_an_unregistered_class_has_the_dimensions_of_its_analysis():
+    class Falling(System):
+        name, title, time_units = "falling", "y'' = -g", "s"
+        state = (Component("height", "m", "height"), Component("rate", "m/s", "rate"))
+        g: float = parameter("m/s2", "acceleration")
+
+        @serves("history")
+        def flow(self):
+            return Flow(lambda angles, y: (y[1], -self.g), (0.0, 0.0), period=1.0)
+
+    found = dt.sweep(dt.history, Falling(g=1.0), over={"g": [1.0, 2.0]}, stop=2.0, num=3)
+    assert found.time.values.tolist() == [0.0, 1.0, 2.0] and found.height.attrs["units"] == "m"
+    np.testing.assert_allclose(found.height[1], [0.0, -1.0, -4.0], atol=1e-9)
 
 
 def test_an_infinite_result_is_missing_and_codes_are_known():

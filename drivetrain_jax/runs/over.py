@@ -22,7 +22,7 @@ from drivetrain_jax._errors import InputError, nearest, shown
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax._units import with_unit
 from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analysis_names
-from drivetrain_jax.analysis._base import checked
+from drivetrain_jax.analysis._base import checked, dimensions_of, make_request
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.runs.axes import Axis, AxisTable, entry_of, spread
 from drivetrain_jax.runs.run import run
@@ -87,7 +87,10 @@ def sweep(
         if system.name in system_names() and get_system(system.name) is type(system):
             return run(_scene_table(own, system, over, outputs, options), out=out, fresh=fresh)
         # A scene names its system, so any other class is that of a function.
-        scene = _function_scene(function, system, over, outputs, options, analysis.variables)
+        names = [outputs] if isinstance(outputs, str) else outputs
+        request = make_request(type(system), analysis, names, options, {*over})
+        dims = dimensions_of(analysis, type(system), request, system.values)
+        scene = _function_scene(function, system, over, outputs, options, analysis.variables, dims)
         return run(scene, out=out, fresh=fresh)
     return run(_function_scene(function, system, over, outputs, options), out=out, fresh=fresh)
 
@@ -147,10 +150,11 @@ def _function_scene(
     outputs: Sequence[str] | None,
     options: Mapping[str, Any],
     results: Sequence[Variable] = (),
+    dims: tuple[Dimension, ...] = (),
 ) -> Scene:
     """The scene of a function: its parameters vary, and a fixed word identifies the computation.
 
-    ``results`` are those of a function that is an analysis, which takes ``outputs`` as an argument.
+    ``results`` with ``dims`` are those of a function that is an analysis, which takes ``outputs`` as an argument.
     """
     if jax.tree_util.treedef_is_leaf(jax.tree.structure(system)):
         raise InputError(f"system: got a {type(system).__name__}; allowed is a pytree, such as a dict of numbers")
@@ -178,10 +182,9 @@ def _function_scene(
     computes = hashlib.blake2b(repr(content).encode(), digest_size=16).hexdigest()
     words = {variable.name: variable for variable in results}
     variables = tuple(words.get(key) or _variable(key, shapes[key]) for key in wanted)
-    kind, analysis = _kind(_Once(one), name, tuple(values), type(system), variables, computes)
+    kind, analysis = _kind(_Once(one), name, tuple(values), type(system), variables, dims, computes)
     axes = tuple(Axis(key, kind.parameter(key), None, numbers) for key, numbers in values.items())
-    dims = dict.fromkeys(dim for variable in variables for dim in variable.dims)
-    names = [*(axis.dim for axis in axes), *wanted, *dims]
+    names = [*(axis.dim for axis in axes), *wanted, *dict.fromkeys(dim for v in variables for dim in v.dims)]
     if double := [label for label in names if names.count(label) > 1]:
         raise InputError(f"over: {double[0]!r} names two dimensions or results; allowed are distinct names")
     text = f'system = "{kind.name}"\nanalysis = "{name}"\n\n[fixed]\n{_COMPUTES} = "{computes}"\n'
@@ -204,7 +207,13 @@ class _Once:
 
 @lru_cache(maxsize=16)
 def _kind(
-    one: _Once, name: str, varies: tuple[str, ...], of: type, variables: tuple[Variable, ...], computes: str
+    one: _Once,
+    name: str,
+    varies: tuple[str, ...],
+    of: type,
+    variables: tuple[Variable, ...],
+    dims: tuple[Dimension, ...],
+    computes: str,
 ) -> tuple[type[System], Analysis]:
     """A system whose parameters vary, and its analysis; cached, so the same function is compiled once."""
     known = {p.name: p for p in of.parameters} if issubclass(of, System) else {}
@@ -226,13 +235,16 @@ def _kind(
         return (Solver(name, over_lanes(solve), chunk=_CHUNK),)
 
     entries = {dim: v.name for v in variables for dim in v.dims}
-    dimensions = tuple(Dimension(dim, f"number of the entry of {name}", ()) for dim, name in entries.items())
+    numbered = {dim: Dimension(dim, f"number of the entry of {name}", ()) for dim, name in entries.items()}
+    dimensions = tuple((numbered | {d.name: d for d in dims if d.name in entries}).values())
     body = {
         "name": FUNCTION,
         "title": of.__name__,
         "parameters": (*described.values(), computing),
         "models": {name: Model(build, varies)},
     }
+    # Analyses ask for them, and figures show them.
+    body |= {key: getattr(of, key) for key in ("state", "state_axis", "displacements") if issubclass(of, System)}
     analysis = Analysis(
         name,
         f"function {name}",

@@ -21,7 +21,7 @@ from drivetrain_jax.analysis._base import checked, checked_solvers, dimensions_o
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.axes import MAX_POINTS, MAX_RANGES, Axis, AxisTable, check_count, entry_of, in_units, spread
 from drivetrain_jax.runs.physical import described, with_parameters
-from drivetrain_jax.systems import System, get_system, system_names
+from drivetrain_jax.systems import System, get_system, register, system_names
 
 Value = float | int | str | tuple[float, ...]
 Ranges = dict[str, tuple[float, float]]
@@ -142,6 +142,8 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
     ``overrides``: see :func:`toml.read`.
     Raises :class:`InputError` with one line that names the field, what was given and what is allowed.
     """
+    if isinstance(source, Mapping) and isinstance(source.get("system"), type):
+        source = {**source, "system": register(source["system"]).name}
     tree, text = toml.read(source, overrides)
     if isinstance(names := tree.get("outputs"), str):
         tree = {**tree, "outputs": names.split(",")}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
+from drivetrain_jax._errors import InputError, shown
 from drivetrain_jax._plugins import SYSTEMS, load_plugin, plugin_names
 from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
 from drivetrain_jax.resonances import Family, Resonances
@@ -39,6 +40,8 @@ _BUILT_IN = {
     "bicardan": "Bicardan",
     "driveline": "Driveline",
 }
+# Classes by name that this process has registered.
+_REGISTERED: dict[str, type[System]] = {}
 
 __all__ = [
     "Balance",
@@ -69,23 +72,60 @@ __all__ = [
     "dense",
     "get_system",
     "parameter",
+    "register",
     "serves",
     "system_names",
 ]
 
 
 def system_names() -> tuple[str, ...]:
-    """Names of all systems: the built-in ones, then those of installed packages."""
-    return (*_BUILT_IN, *(name for name in plugin_names(SYSTEMS) if name not in _BUILT_IN))
+    """Names of all systems: the built-in ones, then those of installed packages, then registered ones."""
+    return tuple(dict.fromkeys((*_BUILT_IN, *plugin_names(SYSTEMS), *_REGISTERED)))
+
+
+def register(system: type[System]) -> type[System]:
+    """Make a class known to scenes and atlases of this process by its name; returns the class, so that it is a decorator.
+
+    Args:
+        system: a subclass of :class:`~drivetrain_jax.systems.System`. It replaces a registered class of the same name, so
+            that a cell of a notebook may be run again.
+
+    Raises: InputError for another object, and for the name of a built-in or installed system.
+
+    >>> import drivetrain_jax as dt
+    >>> from drivetrain_jax.systems import Flow, System, parameter, serves
+    >>> @dt.register
+    ... class Decay(System):
+    ...     name = "decay"
+    ...     title = "x' = -rate x"
+    ...     rate: float = parameter("1/s", "rate of decay")
+    ...
+    ...     @serves("lyapunov")
+    ...     def flow(self):
+    ...         return Flow(lambda angles, y: (-self.rate * y[0],), (1.0,), period=1.0)
+    >>> dt.run({"system": "decay", "analysis": "lyapunov", "axes": {"rate": [2.0]}}).lyapunov_spectrum.round(6).item()
+    -2.0
+    """
+    if not (isinstance(system, type) and issubclass(system, System) and getattr(system, "name", "")):
+        raise InputError(
+            f"system = {shown(system)}: allowed is a subclass of drivetrain_jax.systems.System with a name"
+        )
+    if system.name not in _REGISTERED and system.name in system_names():
+        if get_system(system.name) is not system:
+            raise InputError(f"system = {system.name!r}: names an installed system; allowed is another name")
+        return system
+    _REGISTERED[system.name] = system
+    return system
 
 
 def get_system(name: str) -> type[System]:
     """The system ``name``; ``KeyError`` with the known names if there is none, ``ImportError`` if its package fails."""
+    if name in _REGISTERED:
+        return _REGISTERED[name]
     if name in _BUILT_IN:
         return getattr(import_module(f"drivetrain_jax.systems.{name}"), _BUILT_IN[name])
     system = load_plugin(SYSTEMS, name, "a system", lambda x: isinstance(x, type) and issubclass(x, System))
     if system is None:
-        raise KeyError(
-            f"system = {name!r}: allowed is one of {', '.join(system_names())}, or one that a package registers"
-        )
+        allowed = ", ".join(system_names())
+        raise KeyError(f"system = {name!r}: allowed is one of {allowed}, or one given to drivetrain_jax.register")
     return system
