@@ -232,7 +232,7 @@ def _diffrax(solver: str, settings: Sequence[float], count: int, quick: Sequence
 STUDY = Study(
     "cardan", tuple(REGIONS), ("typical", "ill-conditioned, gamma 1e16"),
     (
-        Method("package, direct", floquet(REGIONS, "direct"), MANY, (1e-5, 1e-9, 1e-13), (1e-9,)),
+        Method("package, direct", floquet(REGIONS, "direct"), MANY, (1e-5, 1e-7, 1e-8, 1e-9, 1e-13), (1e-9,)),
         _diffrax("Tsit5", (1e-5, 1e-9), SOME),
         _diffrax("Dopri5", (1e-5, 1e-9), SOME),
         _diffrax("Dopri8", (1e-6, 1e-10), SOME, (1e-9,)),
@@ -243,7 +243,7 @@ STUDY = Study(
         Method("scipy LSODA", scipy_points("LSODA"), CHECKED, (1e-5, 1e-9)),
         Method("scipy Radau", scipy_points("Radau"), CHECKED, (1e-5, 1e-7, 1e-9), regions=_FAST),
         Method("scipy DOP853, stacked", scipy_stacked, SOME, (1e-5, 1e-9, 1e-12), (1e-9,)),
-        *([Method("heyoka batch", heyoka(REGIONS), MANY, (1e-5, 1e-7, 1e-9, 1e-11, 1e-13), (1e-9,), "tolerance={:g}")]
+        *([Method("heyoka batch", heyoka(REGIONS), MANY, (1e-5, 1e-7, 1e-8, 1e-9, 1e-11, 1e-13), (1e-9,), "tolerance={:g}")]
           if HEYOKA else []),
     ),
     radius_error, _two_references,
@@ -252,8 +252,8 @@ STUDY = Study(
 AGAINST_DAMPING = Study(
     "damping", tuple(DAMPING) if HEYOKA else (), tuple(DAMPING)[:2] if HEYOKA else (),
     (
-        Method("package, direct", floquet(DAMPING, "direct"), MANY, (1e-9,), (1e-9,)),
-        Method("heyoka batch", heyoka(DAMPING), MANY, (1e-9,), (1e-9,), "tolerance={:g}"),
+        Method("package, direct", floquet(DAMPING, "direct"), MANY, (1e-7, 1e-8, 1e-9), (1e-9,)),
+        Method("heyoka batch", heyoka(DAMPING), MANY, (1e-7, 1e-8, 1e-9), (1e-9,), "tolerance={:g}"),
     ),
     radius_error,
 )  # fmt: skip

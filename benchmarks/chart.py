@@ -133,7 +133,7 @@ def _scipy(name: str, method: str, size: str, settings: Sequence[float]) -> Meth
 STUDY = Study(
     "chart", (CELLS,) if HEYOKA else (), (CELLS,) if HEYOKA else (),
     (
-        _cells("package, direct", partial(_package, 30_000, "direct"), (1e-6, 1e-7, 1e-10), (1e-7,)),
+        _cells("package, direct", partial(_package, 30_000, "direct"), (1e-6, 1e-7, 3e-8, 1e-10), (1e-7,)),
         _cells("package, diffrax", partial(_package, COARSE, "diffrax"), (1e-5, 1e-6), (), cells=COARSE),
         _cells("heyoka batch", partial(_rival, "heyoka", 30_000, 0), (1e-8, 2e-9, 1e-10), (1e-10,), label="tolerance={:g}"),
         _cells("heyoka batch, without eigenvalues", partial(_rival, "heyoka, without", 30_000, 0), (1e-8,), (),
