@@ -1,233 +1,31 @@
-"""Stability boundaries as curves: zeros of the analytic boundary functions, traced and polished on the surrogate.
+"""Stability boundaries as curves: zeros of the analytic boundary functions, polished on the surrogate.
 
-Seeds are the tips of all tongues (found by exclusion, so that none is missed), and the crossings with the rim of the
-rectangle and with a few lines across it. Curves also continue inside unstable regions; ``limiting`` is true where they
-bound the stable region.
+All zeros of a function on lines across the rectangle are found by exclusion. Between two lines a curve goes on, turns, or
+leaves the rectangle. Lines are densest beside the tips of tongues and the crossings with the rim, where the number of zeros
+changes. Curves also continue inside unstable regions; ``limiting`` is true where they bound the stable region.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from drivetrain_jax.atlas.criteria import LIMITING, Criteria, growth, limiting, monodromy_error, parameters_at
 from drivetrain_jax.atlas.exclusion import Search, critical_points
 from drivetrain_jax.atlas.panels import Atlas
-from drivetrain_jax.atlas.patches import Patches, on_line, patches_of, roots
+from drivetrain_jax.atlas.patches import Patches, join, on_line, patches_of, roots
 from drivetrain_jax.atlas.tips import polish
 from drivetrain_jax.systems import System
 
-# Zero curves of a function of two coordinates by pseudo-arclength continuation, many curves at a time.
-#
-# Predictor: a step along the tangent; corrector: Newton's method along the gradient. All lengths are relative to the
-# domain. The tangent is the gradient turned by a right angle, so it keeps its sense along a curve and reverses on the other
-# edge of a narrow tongue. A step that lands there turns by 180 degrees and is rejected.
-
-
-# Longest, shortest and first step, largest turn and correction of a step, growth of the steps. Turn and correction decide if
-# a step is accepted. Shortest and first step and growth affect only the number of steps.
-_LONGEST, _SHORTEST, _FIRST = 0.015, 1e-7, 1e-5
-_TURN, _CORRECTION, _GROWTH = 0.25, 0.15, 1.6
-_NEWTON, _MAX_STEPS = 3, 800
-# Largest last Newton step of a point on the curve; between the edges of a narrow tongue Newton's method converges slowly.
-_SETTLED = 1e-9
-# Distances from a tip in the other coordinate at which its flanks are entered: far enough to continue, and near enough for
-# a chord to the tip. A factor of ten either way changes nothing.
-_APPROACH = 1e-4 * np.array([1 / 64, 1 / 16, 1 / 4, 1.0])
-
-
-class Field:
-    """A function with its gradient over a rectangle, in lengths relative to the rectangle."""
-
-    def __init__(self, patches: Patches):
-        self.patches = patches
-        self.lower, self.upper = patches.lower.min(axis=0), patches.upper.max(axis=0)
-        self.slopes = [patches.derivative(axis) for axis in range(2)]
-
-    def bend(self, axis: int) -> Patches:
-        """The second derivative along a coordinate."""
-        return self.slopes[axis].derivative(axis)
-
-    def to_unit(self, x: np.ndarray) -> np.ndarray:
-        """Position in the unit square of points in coordinates."""
-        return (x - self.lower) / (self.upper - self.lower)
-
-    def to_coordinates(self, y: np.ndarray) -> np.ndarray:
-        """Coordinates of points of the unit square."""
-        return self.lower + y * (self.upper - self.lower)
-
-    def __call__(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values ``(N,)`` and gradients ``(N, 2)``; NaN outside the patches."""
-        place = self.patches.locate(self.to_coordinates(y))
-        gradient = np.stack([slope.at(*place) for slope in self.slopes], axis=-1) * (self.upper - self.lower)
-        return self.patches.at(*place), gradient
-
-
-def trace(field: Field, seeds: np.ndarray) -> list[np.ndarray]:
-    """Points ``(n, 2)`` of the zero curve through each of ``seeds`` ``(M, 2)``, in coordinates, to the rim or all around."""
-    start = field.to_unit(np.asarray(seeds, float).reshape(-1, 2))
-    both, sense = np.concatenate([start, start]), np.repeat([1.0, -1.0], len(start))
-    paths, returned = _follow(field, both, sense)
-    curves = []
-    for i in range(len(start)):
-        ahead, behind = paths[i], paths[i + len(start)]
-        points = ahead if returned[i] else np.concatenate([behind[::-1], ahead[1:]])
-        curves.append(field.to_coordinates(points))
-    return curves
-
-
-def trace_tips(field: Field, tips: np.ndarray, horizontal: int) -> list[np.ndarray]:
-    """Points of the zero curves through ``tips`` ``(M, 2)``, where the derivative along ``horizontal`` vanishes.
-
-    A tip may be so sharp (radius 1e-7 of the domain) that no step leads around it. The flanks are therefore entered a
-    little away from it, where f f_hh < 0, by Newton's method along ``horizontal``, and followed from there.
-    """
-    top = field.to_unit(np.asarray(tips, float).reshape(-1, 2))
-    flanks = np.stack([_flank(field, top, horizontal, side) for side in (-1.0, 1.0)])
-    start = flanks[:, :, -1].reshape(-1, 2)
-    _, gradient = field(start)
-    # Away from the tip: the tangent in the direction from the tip to the flank.
-    away = start - np.concatenate([top, top])
-    sense = np.sign(-gradient[:, 1] * away[:, 0] + gradient[:, 0] * away[:, 1])
-    paths, _ = _follow(field, start, sense)
-    curves = []
-    for i, point in enumerate(top):
-        left, right = (np.concatenate([flanks[k, i], paths[i + k * len(top)][1:]]) for k in range(2))
-        points = np.concatenate([left[::-1], point[None], right])
-        points = points[np.isfinite(points).all(axis=1)]
-        curves.append(field.to_coordinates(points))
-    return curves
-
-
-def _flank(field: Field, top: np.ndarray, h: int, side: float) -> np.ndarray:
-    """Points on one flank of each tip, ``(M, k, 2)``, at the distances ``_APPROACH`` in the coordinate other than ``h``."""
-    v, bend = 1 - h, field.bend(h)
-
-    def curvature(y: np.ndarray) -> np.ndarray:
-        return bend.at(*field.patches.locate(field.to_coordinates(y))) * (field.upper - field.lower)[h] ** 2
-
-    inwards = -np.sign(field(top)[1][:, v] * curvature(top))
-    points = np.empty((len(top), len(_APPROACH), 2))
-    y = top.copy()
-    for k, distance in enumerate(_APPROACH):
-        y[:, v] = top[:, v] + inwards * distance
-        with np.errstate(all="ignore"):
-            # A slanted ridge shifts by more than the width of its tongue: start from the ridge there, not from the tip.
-            for _ in range(_NEWTON):
-                y[:, h] -= field(y)[1][:, h] / curvature(y)
-            edge = y.copy()
-            edge[:, h] += side * np.sqrt(-2 * field(y)[0] / curvature(y))
-            for _ in range(_NEWTON):
-                value, gradient = field(edge)
-                edge[:, h] -= value / gradient[:, h]
-        points[:, k] = edge
-    return points
-
-
-def _follow(field: Field, start: np.ndarray, sense: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
-    """Paths from ``start`` along the tangent of ``sense``, and flags of those that returned."""
-    y, _, tangent = _correct(field, start, sense)
-    step = np.full(len(y), _FIRST)
-    first, length = y.copy(), np.zeros(len(y))
-    paths = [[point] for point in first]
-    returned = np.zeros(len(y), bool)
-    alive = np.isfinite(y).all(axis=1) & np.isfinite(tangent).all(axis=1)
-    for _ in range(_MAX_STEPS):
-        mine = np.flatnonzero(alive)
-        if not mine.size:
-            break
-        ahead = y[mine] + step[mine, None] * tangent[mine]
-        new, moved, turned = _correct(field, ahead, sense[mine])
-        # Outside there is no curve to correct to.
-        gone = _outside(ahead) | _outside(new)
-        ends = np.where(_outside(ahead)[:, None], ahead, new)[gone]
-        new[gone], moved[gone], turned[gone] = _meet_rim(field, y[mine[gone]], ends, sense[mine[gone]])
-        cosine = (turned * tangent[mine]).sum(axis=1)
-        good = (moved <= _CORRECTION * step[mine]) & (cosine >= np.cos(_TURN))
-        gone &= good
-        home = good & ~gone & _passes(first[mine], y[mine], new, length[mine])
-        for i, point, back in zip(mine[good], new[good], home[good], strict=True):
-            paths[i].append(first[i] if back else point)
-        returned[mine[home]] = True
-        length[mine[good]] += step[mine[good]]
-        y[mine[good]], tangent[mine[good]] = new[good], turned[good]
-        easy = good & (cosine > np.cos(_TURN / 3))
-        step[mine[easy]] = np.minimum(step[mine[easy]] * _GROWTH, _LONGEST)
-        step[mine[~good]] /= 4
-        alive[mine] = ~gone & ~home & (step[mine] > _SHORTEST)  # pyright: ignore[reportIndexIssue]
-    return [np.stack(path) for path in paths], returned
-
-
-def _correct(field: Field, y: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points on the curve near ``y``, their shifts, and the unit tangents there."""
-    new = y.copy()
-    for _ in range(_NEWTON):
-        value, gradient = field(new)
-        with np.errstate(all="ignore"):
-            last = (value / (gradient**2).sum(axis=1))[:, None] * gradient
-        new = new - last
-    tangent = _tangent(field(new)[1], sense)
-    moved = np.linalg.norm(new - y, axis=1)
-    settled = np.isfinite(moved) & (np.linalg.norm(last, axis=1) <= _SETTLED)
-    return new, np.where(settled, moved, np.inf), tangent
-
-
-def _tangent(gradient: np.ndarray, sense: np.ndarray) -> np.ndarray:
-    with np.errstate(all="ignore"):
-        normal = gradient / np.linalg.norm(gradient, axis=1)[:, None]
-    return np.stack([-normal[:, 1], normal[:, 0]], axis=-1) * sense[:, None]
-
-
-def _outside(y: np.ndarray) -> np.ndarray:
-    return ((y < 0) | (y > 1)).any(axis=1)  # pyright: ignore[reportReturnType]
-
-
-def _meet_rim(
-    field: Field, a: np.ndarray, b: np.ndarray, sense: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The point where the curve meets the rim between ``a`` inside and ``b`` outside, as from :func:`_correct`."""
-    new = np.array([_to_rim(field, *ends) for ends in zip(a, b, strict=True)]).reshape(-1, 2)
-    value, gradient = field(new)
-    way, step = new - a, b - a
-    with np.errstate(all="ignore"):
-        beside = np.abs(way[:, 0] * step[:, 1] - way[:, 1] * step[:, 0]) / np.linalg.norm(step, axis=1)
-        settled = np.abs(value) <= _SETTLED * np.linalg.norm(gradient, axis=1)
-    return new, np.where(settled, beside, np.inf), _tangent(gradient, sense)
-
-
-def _passes(first: np.ndarray, a: np.ndarray, b: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """True if the step from ``a`` to ``b`` passes the first point again."""
-    step = b - a
-    size = np.linalg.norm(step, axis=1)
-    # A path that starts on the rim and leads outwards ends at its start.
-    with np.errstate(invalid="ignore"):
-        along = ((first - a) * step).sum(axis=1) / size
-        across = np.linalg.norm(first - a - (along / size)[:, None] * step, axis=1)
-    return (length > 4 * size) & (along >= 0) & (along <= size) & (across < 0.1 * size)
-
-
-def _to_rim(field: Field, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The point of the curve on the rim between ``a`` inside and ``b`` outside."""
-    with np.errstate(all="ignore"):
-        fractions = np.where(b < 0, a / (a - b), np.where(b > 1, (1 - a) / (b - a), np.inf))
-    axis = int(np.argmin(fractions))
-    # Along the rim both points may lie outside by rounding, and the line through them meets it far away.
-    y = a + np.clip(fractions[axis], 0.0, 1.0) * (b - a)
-    y[axis] = float(b[axis] > 1)
-    other = 1 - axis
-    for _ in range(_NEWTON):
-        value, gradient = field(y[None])
-        step = value[0] / gradient[0, other] if gradient[0, other] else np.nan
-        if not abs(step) < _LONGEST:
-            break
-        y[other] -= step
-    return np.clip(y, 0.0, 1.0)
-
-
-# Number of lines across the rectangle in each direction, for seeds.
-_LINES = 8
+# Longest step of a curve relative to the rectangle, rounds in which lines are added for it, most lines of a round, and lines
+# whose zeros are found together.
+_LONGEST, _ROUNDS, _MOST, _TOGETHER = 0.015, 12, 400, 32
+# Smallest distance of two lines relative to the rectangle.
+_NEAR = 1e-9
 # Newton steps of the last polish, and their largest relative shift.
 _POLISH, _LARGEST_SHIFT = 2, 1e-4
 
@@ -267,17 +65,13 @@ def boundaries(atlas: Atlas, system: type[System], searches: Sequence[Search] = 
     found: list[Boundary] = []
     horizontal = _narrow_axis(atlas, system)
     for number, kind in enumerate(criteria.multipliers):
-        field = Field(patches[number])
-        curves: list[np.ndarray] = []
+        zeros, tips = ZeroSet(patches[number], horizontal), np.empty((0, 2))
         if not criteria.conservative:
-            search = searches[number] if searches else critical_points(patches, number, horizontal)
-            rough = search.points
+            rough = (searches[number] if searches else critical_points(patches, number, horizontal)).points
             fine = polish(criteria, rough, kind, horizontal)[0]
-            near = np.abs(field.to_unit(fine) - field.to_unit(rough)).max(axis=1, initial=0.0) < _LARGEST_SHIFT
-            curves = _distinct(field, np.where(near[:, None], fine, rough), [], horizontal)
-        for seeds in _line_seeds(field):
-            curves = _distinct(field, seeds, curves)
-        found += [_finish(criteria, field, kind, curve) for curve in curves]
+            near = (np.abs(fine - rough) < _LARGEST_SHIFT * zeros.scale).all(axis=1)
+            tips = np.where(near[:, None], fine, rough)
+        found += [_finish(criteria, zeros, kind, curve) for curve in zeros.curves(tips)]
     return tuple(found)
 
 
@@ -287,58 +81,166 @@ def _narrow_axis(atlas: Atlas, system: type[System]) -> int:
     return atlas.parameters.index(axis) if axis in atlas.parameters else 1
 
 
-def _distinct(
-    field: Field, seeds: np.ndarray, known: list[np.ndarray], horizontal: int | None = None
-) -> list[np.ndarray]:
-    """``known`` curves, and those through other ``seeds``, which are tips if ``horizontal`` is given."""
-    kept = list(known)
-    on_curve = np.zeros(len(seeds), bool)
-    for curve in kept:
-        on_curve |= _contains(field, curve, seeds)
-    new = seeds[~on_curve].reshape(-1, 2)
-    curves = trace(field, new) if horizontal is None else trace_tips(field, new, horizontal)
-    for seed, curve in zip(new, curves, strict=True):
-        if len(curve) > 2 and not any(_contains(field, other, seed[None])[0] for other in kept[len(known) :]):
-            kept.append(curve)
-    return kept
+class ZeroSet:
+    """The zeros of a function over a rectangle, on lines along the coordinate ``h``."""
+
+    def __init__(self, patches: Patches, h: int) -> None:
+        self.lower, self.upper = patches.lower.min(axis=0), patches.upper.max(axis=0)
+        self.scale, self.h, self.v = self.upper - self.lower, h, 1 - h
+        # Curves are those of the surrogate, also where its error is larger than its values.
+        nothing = np.zeros((1, 1, len(patches)))
+        self._patches = replace(patches, lever=nothing, floor=np.zeros(len(patches)))
+
+    def curves(self, tips: np.ndarray) -> list[np.ndarray]:
+        """The curves ``(n, 2)``; ``tips`` ``(M, 2)`` are points where a curve turns."""
+        rim = self._rim()
+        breaks = np.unique([0.0, 1.0, *self._height(tips), *self._height(rim)])
+        lines = {0.0, 1.0}
+        for low, high in pairwise(breaks):
+            count = math.ceil((high - low) * math.pi / 2 / _LONGEST) + 1
+            lines |= set(low + (high - low) * (1 - np.cos(np.pi * np.arange(1, count) / count)) / 2)
+        known: dict[float, np.ndarray] = {}
+        for _ in range(_ROUNDS):
+            known |= self._on_lines(sorted(lines - known.keys()))
+            points, links = self._linked(known, tips, rim)
+            lines = known.keys() | set(self._between(points, links, known))
+            if len(lines) == len(known) or len(lines) > _MOST + len(breaks):
+                break
+        return [points[chain] for chain in _chains(len(points), links)]
+
+    def _height(self, points: np.ndarray) -> np.ndarray:
+        """Positions of points along v, between 0 and 1."""
+        return np.clip((points[:, self.v] - self.lower[self.v]) / self.scale[self.v], 0.0, 1.0)
+
+    def _points(self, height: float, x: np.ndarray) -> np.ndarray:
+        value = self.lower[self.v] * (1 - height) + self.upper[self.v] * height
+        return np.insert(x[:, None], self.v, value, axis=1)
+
+    def _rim(self) -> np.ndarray:
+        """Crossings with the two sides along v, ``(K, 2)``."""
+        ends = [self.lower[self.h], self.upper[self.h]]
+        found = [roots(on_line(self._patches, self.h, float(end))).x for end in ends]
+        return np.concatenate([np.insert(x[:, None], self.h, end, axis=1) for x, end in zip(found, ends, strict=True)])
+
+    def _on_lines(self, heights: Sequence[float]) -> dict[float, np.ndarray]:
+        """The zeros on lines, ``(n, 2)`` by the position of the line; neighbours have slopes of different signs."""
+        found, width = {}, 2 * self.scale[self.h]
+        for part in (heights[i : i + _TOGETHER] for i in range(0, len(heights), _TOGETHER)):
+            # All lines one behind the other are one line.
+            values = self._points(0.0, np.zeros(len(part)))[:, self.v] + np.array(part) * self.scale[self.v]
+            pieces = [on_line(self._patches, self.v, float(value)) for value in values]
+            together = [
+                replace(piece, lower=piece.lower + k * width, upper=piece.upper + k * width)
+                for k, piece in enumerate(pieces)
+            ]
+            all_zeros = roots(join(together))
+            number = np.floor((all_zeros.x - self.lower[self.h]) / width + 0.25)
+            for k, height in enumerate(part):
+                mine = number == k
+                sign = np.sign(all_zeros.slope[mine])
+                # A zero on a common face of two patches may be found twice.
+                new = sign != np.concatenate([[0.0], sign[:-1]])
+                x = np.clip(all_zeros.x[mine][new] - k * width, self.lower[self.h], self.upper[self.h])
+                found[height] = np.column_stack([self._points(height, x), sign[new]])
+        return found
+
+    def _linked(
+        self, known: Mapping[float, np.ndarray], tips: np.ndarray, rim: np.ndarray
+    ) -> tuple[np.ndarray, list[tuple[int, int]]]:
+        """All points of the curves, and the pairs of them that follow each other."""
+        heights = sorted(known)
+        starts = np.cumsum([0, *(len(known[height]) for height in heights)])
+        points = np.concatenate([*(known[height][:, :2] for height in heights), tips, rim])
+        first_tip, first_rim, links = int(starts[-1]), int(starts[-1]) + len(tips), []
+        tip_at, rim_at = self._height(tips), self._height(rim)
+        for (k, low), (_, high) in pairwise(enumerate(heights)):
+            below, above = known[low], known[high]
+            same = _matched(below[:, self.h], below[:, 2], above[:, self.h], above[:, 2])
+            links += [(int(starts[k] + i), int(starts[k + 1] + j)) for i, j in same]
+            left = [sorted(set(range(len(side))) - {pair[n] for pair in same}) for n, side in enumerate((below, above))]
+            for i in np.flatnonzero((low <= rim_at) & (rim_at <= high)):
+                far = rim[i, self.h] > self.lower[self.h] + self.scale[self.h] / 2
+                ends = [(side, rest[-1 if far else 0]) for side, rest in enumerate(left) if rest]
+                if ends:
+                    side, end = min(ends, key=lambda e: abs((below, above)[e[0]][e[1], self.h] - rim[i, self.h]))
+                    left[side].remove(end)
+                    links.append((int(starts[k + side] + end), first_rim + int(i)))
+            pairs = [int(starts[k + side]) + np.array(pair) for side in (0, 1) for pair in _neighbours(left[side])]
+            middle: dict[int, int] = {}
+            for i in np.flatnonzero((low <= tip_at) & (tip_at <= high)) if pairs else ():
+                apart = [abs(points[pair, self.h].mean() - tips[i, self.h]) for pair in pairs]
+                middle.setdefault(int(np.argmin(apart)), first_tip + int(i))
+            for n, (a, b) in enumerate(pairs):
+                links += pairwise([int(a), *([middle[n]] if n in middle else []), int(b)])
+        return points, links
+
+    def _between(
+        self, points: np.ndarray, links: Sequence[tuple[int, int]], known: Mapping[float, np.ndarray]
+    ) -> Iterator[float]:
+        """Further lines across links that are too long."""
+        heights = np.array(sorted(known))
+        for pair in links:
+            ends = self._height(points[list(pair)])
+            length = np.abs(np.diff(points[list(pair)], axis=0)[0] / self.scale).max()
+            if length <= _LONGEST:
+                continue
+            low, high = sorted(ends)
+            if high - low <= _NEAR:
+                # A turn without a known tip lies between this line and one of its neighbours.
+                place = np.searchsorted(heights, low)
+                yield from (heights[place - 1 : place + 2][1:] + heights[place - 1 : place + 2][:-1]) / 2
+                continue
+            # Lines are denser towards the end that is no line: there the curve turns.
+            t = np.linspace(0, 1, min(math.ceil(length / _LONGEST), 8) + 1)[1:-1]
+            turn = [end not in known for end in (low, high)]
+            t = t**2 if turn[0] and not turn[1] else 1 - (1 - t) ** 2 if turn[1] and not turn[0] else t
+            yield from low + (high - low) * t
 
 
-def _contains(field: Field, curve: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """Flags of ``seeds`` ``(M, 2)`` that lie on ``curve``."""
-    if not len(seeds):
-        return np.zeros(0, bool)
-    y, target = field.to_unit(curve), field.to_unit(seeds)
-    step = np.diff(y, axis=0)
-    size = (step**2).sum(axis=1)
-    with np.errstate(all="ignore"):
-        t = np.clip(np.nan_to_num(((target[:, None] - y[:-1]) * step).sum(axis=2) / size), 0.0, 1.0)
-    distance = np.linalg.norm(y[:-1] + t[..., None] * step - target[:, None], axis=2)
-    best = np.argmin(distance, axis=1)
-    distance, t = (a[np.arange(len(seeds)), best] for a in (distance, t))
-    # The chord of a step that turns by less than a quarter is at most a thirtieth of its length away from the curve. The
-    # other edge of a narrow tongue may be as near, but has the opposite gradient.
-    _, at_seed = field(target)
-    _, at_curve = field(y[best + (t > 0.5)])
-    near = distance < 0.04 * np.sqrt(size[best]) + 1e-9
-    return near & (((at_seed * at_curve).sum(axis=1) > 0) | (distance < 1e-9))
+def _matched(x: np.ndarray, sign: np.ndarray, y: np.ndarray, other: np.ndarray) -> list[tuple[int, int]]:
+    """Zeros of two neighbouring lines on the same curves: all in order, or else those nearest to each other."""
+    if len(x) == len(y) and (sign == other).all():
+        return [(i, i) for i in range(len(x))]
+    if not len(x) or not len(y):
+        return []
+    apart = np.where(sign[:, None] == other, np.abs(x[:, None] - y), np.inf)
+    there, back = apart.argmin(axis=1), apart.argmin(axis=0)
+    return [(i, int(j)) for i, j in enumerate(there) if back[j] == i and np.isfinite(apart[i, j])]
 
 
-def _line_seeds(field: Field) -> Iterator[np.ndarray]:
-    """Crossings with the four sides of the rim, then with lines across the rectangle."""
-    across = np.arange(1, _LINES) / _LINES
-    for fractions in ([1.0], [0.0], across):
-        for axis in range(2):
-            seeds = []
-            for value in field.lower[axis] + np.array(fractions) * (field.upper[axis] - field.lower[axis]):
-                x = roots(on_line(field.patches, axis, float(value))).x
-                seeds.append(np.insert(x[:, None], axis, value, axis=1))
-            yield np.clip(np.concatenate(seeds), field.lower, field.upper)
+def _neighbours(numbers: Sequence[int]) -> Iterator[tuple[int, int]]:
+    """Pairs of consecutive numbers, each number once."""
+    k = 0
+    while k + 1 < len(numbers):
+        if numbers[k + 1] == numbers[k] + 1:
+            yield numbers[k], numbers[k + 1]
+            k += 1
+        k += 1
 
 
-def _finish(criteria: Criteria, field: Field, kind: str, curve: np.ndarray) -> Boundary:
+def _chains(count: int, links: Sequence[tuple[int, int]]) -> list[list[int]]:
+    """The paths and cycles of at least three points that ``links`` make of ``count`` points."""
+    following: list[list[int]] = [[] for _ in range(count)]
+    for a, b in links:
+        following[a].append(b)
+        following[b].append(a)
+    chains, seen = [], set()
+    for start in sorted(range(count), key=lambda i: len(following[i])):
+        if start in seen or not following[start]:
+            continue
+        chain = [start]
+        seen.add(start)
+        while rest := [i for i in following[chain[-1]] if i not in seen]:
+            chain.append(rest[0])
+            seen.add(rest[0])
+        closed = len(chain) > 2 and start in following[chain[-1]]
+        chains += [[*chain, start] if closed else chain] if len(chain) > 2 else []
+    return chains
+
+
+def _finish(criteria: Criteria, zeros: ZeroSet, kind: str, curve: np.ndarray) -> Boundary:
     """Polish the points of a curve with the multiplier itself."""
-    # Rounding of Newton's method may move points of the rim outside.
-    x = _polish(criteria, field, kind, np.clip(curve, field.lower, field.upper))
+    x = _polish(criteria, zeros, kind, curve)
     points = dict(zip(criteria.atlas.parameters, parameters_at(criteria.atlas, x).T, strict=True))
     return Boundary(kind, points, _limiting(criteria, x, kind))
 
@@ -352,11 +254,11 @@ def _limiting(criteria: Criteria, x: np.ndarray, kind: str) -> np.ndarray:
     return np.log(criteria.spectral_radius(x)) <= LIMITING + error
 
 
-def _polish(criteria: Criteria, field: Field, kind: str, x: np.ndarray) -> np.ndarray:
+def _polish(criteria: Criteria, zeros: ZeroSet, kind: str, x: np.ndarray) -> np.ndarray:
     """Points with ln|sigma| = 0 near ``x``; ``x`` itself if the multiplier is not simple there."""
     if criteria.conservative:
         return x
-    scale = field.upper - field.lower
+    scale = zeros.scale
     kinds = [kind] * len(x)
     best = x.copy()
     for _ in range(_POLISH):
@@ -365,6 +267,6 @@ def _polish(criteria: Criteria, field: Field, kind: str, x: np.ndarray) -> np.nd
         with np.errstate(all="ignore"):
             step = (rates.rate / (gradient**2).sum(axis=1))[:, None] * gradient
         good = np.linalg.norm(step, axis=1) < _LARGEST_SHIFT
-        best = np.clip(np.where(good[:, None], best - step * scale, best), field.lower, field.upper)
+        best = np.clip(np.where(good[:, None], best - step * scale, best), zeros.lower, zeros.upper)
     good &= np.abs(growth(criteria, best, kinds).rate) < 1e-8
     return np.where(good[:, None], best, x)

@@ -1,4 +1,4 @@
-"""Exclusion and tracing on known polynomials."""
+"""Exclusion and zero curves on known polynomials."""
 
 from __future__ import annotations
 
@@ -54,33 +54,44 @@ def test_the_error_includes_trimmed_coefficients():
     assert trimmed.error == pytest.approx([0.1001])
 
 
-def test_a_curve_is_traced_both_ways_from_its_seed():
-    """The seed is near the vertex of the parabola h = (2 v^2 - 1)/5, which ends at the rim."""
-    field = boundaries.Field(one_patch([[0.0, 0.0, -0.2], [1.0, 0.0, 0.0]]))
-    (curve,) = boundaries.trace(field, np.array([[-0.21, 0.0]]))
-    h, v = curve.T
-    assert h == pytest.approx((2 * v**2 - 1) / 5, abs=1e-12)
-    assert np.abs(np.diff(curve, axis=0)).max() < 0.04 and (np.diff(v) > 0).all() == (v[0] < 0)
-    assert sorted([v[0], v[-1]]) == [-1.0, 1.0]
+def curves(coefficients, tips=()):
+    """The zero curves of a polynomial over [-1, 1]^2 on lines along its first coordinate."""
+    found = boundaries.ZeroSet(one_patch(coefficients), 0).curves(np.array(tips).reshape(-1, 2))
+    for curve in found:
+        assert np.abs(np.diff(curve, axis=0)).max() < 0.032
+        value = np.polynomial.chebyshev.chebval2d(*curve.T, np.array(coefficients))
+        known = (np.abs(curve[:, None] - np.array(tips).reshape(1, -1, 2)) < 1e-12).all(axis=2).any(axis=1)
+        assert np.abs(value[~known]).max() < 1e-12
+    return found
+
+
+def test_a_curve_runs_from_rim_to_rim():
+    """The parabola h = (2 v^2 - 1)/5, and a line that leaves through the other two sides, almost along the lines."""
+    (curve,) = curves([[0.0, 0.0, -0.2], [1.0, 0.0, 0.0]])
+    assert sorted(curve[[0, -1], 1]) == [-1.0, 1.0] and abs(abs(np.diff(curve[:, 1]).sum()) - 2) < 1e-12
+    (line,) = curves([[0.0, -20.0], [1.0, 0.0]])
+    assert sorted(map(tuple, line[[0, -1]])) == [pytest.approx((-1, -0.05)), pytest.approx((1, 0.05))]
+
+
+@pytest.mark.parametrize("tips", [[], [[0.0, 0.0]]], ids=["unknown", "known"])
+def test_a_curve_turns_at_its_tip(tips):
+    """The parabola v = h^2."""
+    (curve,) = curves([[0.5, -1.0], [0.0, 0.0], [0.5, 0.0]], tips)
+    assert sorted(curve[[0, -1], 0]) == pytest.approx([-1, 1])
+    assert curve[:, 1].min() == 0 if tips else curve[:, 1].min() < 1e-3
 
 
 def test_a_closed_curve_ends_where_it_began():
-    """The seed is near the circle of radius 1/2."""
-    field = boundaries.Field(one_patch([[0.75, 0.0, 0.5], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]))
-    (curve,) = boundaries.trace(field, np.array([[0.51, 0.0]]))
+    """The circle of radius 1/2 goes around once."""
+    (curve,) = curves([[0.75, 0.0, 0.5], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]], [[0.0, -0.5], [0.0, 0.5]])
     assert np.array_equal(curve[0], curve[-1])
-    assert np.linalg.norm(curve, axis=1) == pytest.approx(np.full(len(curve), 0.5), abs=1e-12)
-    # The path goes around once.
     assert np.linalg.norm(np.diff(curve, axis=0), axis=1).sum() == pytest.approx(np.pi, rel=1e-3)
 
 
-def test_the_other_edge_of_a_narrow_tongue_is_another_curve():
-    """The edges of h^2 = 1e-8 are nearer to each other than chords are to curves."""
-    field = boundaries.Field(one_patch([[0.5 - 1e-8, 0.0], [0.0, 0.0], [0.5, 0.0]]))
-    v = np.linspace(-1.0, 1.0, 101)
-    edge = np.stack([np.full(101, 1e-4), v], axis=-1)
-    seeds = np.array([[1e-4, 0.013], [-1e-4, 0.013], [0.5, 0.013]])
-    assert boundaries._contains(field, edge, seeds).tolist() == [True, False, False]
+def test_the_edges_of_a_narrow_tongue_are_two_curves():
+    """h^2 = 1e-8."""
+    found = curves([[0.5 - 1e-8, 0.0], [0.0, 0.0], [0.5, 0.0]])
+    assert sorted(curve[:, 0].mean() for curve in found) == pytest.approx([-1e-4, 1e-4])
 
 
 def test_segments_leave_out_points_that_are_not_limiting():
@@ -90,89 +101,16 @@ def test_segments_leave_out_points_that_are_not_limiting():
     assert [part["beta"].tolist() for part in curve.segments()] == [[0.0, 1.0], [3.0, 4.0]]
 
 
-def test_a_path_ends_on_the_rim():
-    """A straight path has both ends on the rim; on a bent one the last step is corrected along the rim."""
-    (curve,) = boundaries.trace(boundaries.Field(one_patch([[-0.3, 0.0], [1.0, 0.0]])), np.array([[0.3, 0.1]]))
-    assert sorted(curve[[0, -1], 1]) == [-1.0, 1.0]
-
-    def field(y):
-        slope = np.stack([np.ones(len(y)), -0.6 * (y[:, 1] - 1)], axis=-1)
-        return y[:, 0] - 0.5 - 0.3 * (y[:, 1] - 1) ** 2, slope
-
-    end = boundaries._to_rim(field, np.array([0.50003, 0.99]), np.array([0.50003, 1.01]))
-    assert end == pytest.approx([0.5, 1.0], abs=1e-12)
-
-
-def test_a_path_along_the_rim_ends_there():
-    """Both points of a step lie outside by rounding, and the line through them meets the rim far away."""
-
-    def field(y):
-        return np.zeros(len(y)), np.tile([1.0, 0.0], (len(y), 1))
-
-    end = boundaries._to_rim(field, np.array([-1e-9, 0.5]), np.array([-1.0000001e-9, 0.51]))
-    assert end == pytest.approx([0.0, 0.5], abs=0.02)
-
-
 @pytest.mark.parametrize(("foot", "width"), [(-0.5, 1e-6), (0.0, 1e-6), (0.0, 1e-7)])
 def test_points_lie_on_the_edges_of_a_narrow_slanted_tongue(foot, width):
-    """The tongue is (h - 0.3 v - 0.3 v^2)^2 = width (v - foot), slanted at its tip except in the first case.
-
-    A point of slow convergence must not count as a point of the curve, and the flanks must lie on different edges.
-    """
+    """The tongue is (h - 0.3 v - 0.3 v^2)^2 = width (v - foot), slanted at its tip except in the first case."""
     t = np.cos(np.pi * (np.arange(8) + 0.5) / 8)
     analysis = np.linalg.inv(np.polynomial.chebyshev.chebvander(t, 7))
     h, v = np.meshgrid(t, t, indexing="ij")
     values = (h - 0.3 * v - 0.3 * v**2) ** 2 - width * (v - foot)
-    field = boundaries.Field(one_patch(analysis @ values @ analysis.T))
-    (curve,) = boundaries.trace_tips(field, np.array([[0.3 * foot + 0.3 * foot**2, foot]]), 0)
-    value, gradient = field(field.to_unit(curve))
+    (curve,) = curves(analysis @ values @ analysis.T, [[0.3 * foot + 0.3 * foot**2, foot]])
     h, v = curve.T
     top = np.argmin(np.abs(v - foot))
-    assert (np.abs(value) / np.linalg.norm(gradient, axis=1))[np.arange(len(v)) != top].max() < 1e-9
     side = np.sign(h - 0.3 * v - 0.3 * v**2)
-    assert (side[:top] == -1).all() and (side[top + 1 :] == 1).all()
-    assert v[0] == v[-1] == 1.0
-
-
-def test_turns_of_steps_are_limited():
-    """On this circle the turn limits the step: no step turns by more than a quarter, and none by far less."""
-    radius = 0.02
-
-    def field(y):
-        return ((y - 0.5) ** 2).sum(axis=1) - radius**2, 2 * (y - 0.5)
-
-    (path,), returned = boundaries._follow(field, np.array([[0.5 + radius, 0.5]]), np.ones(1))
-    assert returned.all() and 50 < len(path) < 100
-    angle = np.unwrap(np.arctan2(path[:, 1] - 0.5, path[:, 0] - 0.5))
-    assert abs(angle[-1] - angle[0]) == pytest.approx(2 * np.pi)
-    turns = np.abs(np.diff(angle))[-30:-2]
-    # A step grows by 1.6 while it turns by less than a twelfth of a radian.
-    assert turns.min() > 1 / 12 and turns.max() < 1.65 / 12
-
-
-@pytest.mark.parametrize(("shift", "end"), [(0.0015, 1.0), (0.004, 0.6)])
-def test_a_large_correction_belongs_to_another_curve(shift, end):
-    """A straight line jumps at v = 0.6 by a tenth or a quarter of the longest step.
-
-    The tangent stays the same, so only the size of the correction shows the jump.
-    """
-
-    def field(y):
-        return y[:, 0] - 0.5 - shift * (y[:, 1] > 0.6), np.tile([1.0, 0.0], (len(y), 1))
-
-    (path,), _ = boundaries._follow(field, np.array([[0.5, 0.3]]), np.ones(1))
-    assert path[-1, 1] == pytest.approx(end, abs=1e-6)
-
-
-def test_a_path_ends_where_the_function_is_undefined():
-    """The function has values only below v = 0.7: the step is divided down to the shortest one in few evaluations."""
-    asked = []
-
-    def field(y):
-        asked.append(len(y))
-        known = np.where(y[:, 1] < 0.7, 1.0, np.nan)
-        return (y[:, 0] - 0.5) * known, np.tile([1.0, 0.0], (len(y), 1)) * known[:, None]
-
-    (path,), returned = boundaries._follow(field, np.array([[0.5, 0.3]]), np.ones(1))
-    assert path[-1] == pytest.approx([0.5, 0.7], abs=1e-6) and not returned.any()
-    assert len(asked) < 400
+    assert len(set(side[:top])) == len(set(side[top + 1 :])) == 1 and side[0] == -side[-1]
+    assert v[0] == v[-1] == 1.0 and v[top] == foot
