@@ -211,6 +211,7 @@ _COMMANDS: dict[str, tuple[str, tuple[Any, ...]]] = {
     "design": ("answer a design question from a stored atlas", (
         _argument("question", "QUESTION", ", ".join(_QUESTIONS), choices=_QUESTIONS),
         _ATLAS, _given("parameters; a range is name=LOW:HIGH"), _AMPLITUDE,
+        _argument("--vary", "NAME", "parameter in place of the damping (its least value) or the angle (its largest value)"),
         _argument("--margin", "PART", "speed-windows: relative distance in speed from every boundary", type=number),
         _JSON,
     )),
@@ -535,6 +536,9 @@ def design(options: argparse.Namespace) -> int:
     extra = {} if options.margin is None else {"margin": options.margin}
     if extra and options.question != "speed-windows":
         raise InputError(f"--margin = {options.margin}: not used by {options.question}; allowed for speed-windows")
+    if options.vary and options.question == "speed-windows":
+        raise InputError(f"--vary = {options.vary!r}: not used by speed-windows; allowed for the other questions")
+    extra |= {"vary": options.vary} if options.vary else {}
     given = ranges(options.given, "design")
     question = getattr(atlas_answers, options.question.replace("-", "_"))
     with _reading(options.file):

@@ -253,10 +253,14 @@ def least_damping(
     speeds: Range,
     at: Mapping[str, float],
     *,
+    vary: str = "",
     direct: Direct | None = None,
 ) -> Answer:
-    """The least damping above which, up to the largest of the atlas, all ``speeds`` are stable."""
-    return _extreme(_over(atlas, system, at, "speed", "damping"), system, speeds, 1.0, direct)
+    """The least damping above which, up to the largest of the atlas, all ``speeds`` are stable; or the least value of the
+    parameter ``vary``."""
+    return _extreme(
+        _over(atlas, at, system.roles["speed"], vary or system.roles["damping"]), system, speeds, 1.0, direct
+    )
 
 
 def widest_angle(
@@ -265,10 +269,14 @@ def widest_angle(
     speeds: Range,
     at: Mapping[str, float],
     *,
+    vary: str = "",
     direct: Direct | None = None,
 ) -> Answer:
-    """The widest angle below which, down to the smallest of the atlas, all ``speeds`` are stable."""
-    return _extreme(_over(atlas, system, at, "speed", "angle"), system, speeds, -1.0, direct)
+    """The widest angle below which, down to the smallest of the atlas, all ``speeds`` are stable; or the largest value of
+    the parameter ``vary``."""
+    return _extreme(
+        _over(atlas, at, system.roles["speed"], vary or system.roles["angle"]), system, speeds, -1.0, direct
+    )
 
 
 def speed_windows(
@@ -283,7 +291,7 @@ def speed_windows(
 
     Each is shortened by ``margin`` times the speed at both ends, except at the end of the atlas; empty ranges are left out.
     """
-    part = _over(atlas, system, at, "speed")
+    part = _over(atlas, at, system.roles["speed"])
     line = stability_along(part, system)
     criteria = Criteria.of(part, system)
     windows = []
@@ -299,9 +307,9 @@ def speed_windows(
     return Windows(tuple(windows), tuple(i for i in line.intervals if not i.stable), line.undecided)
 
 
-def _over(atlas: Atlas, system: type[System], at: Mapping[str, float], *roles: str) -> Atlas:
-    """``atlas`` restricted to ``at``, over exactly the parameters with these ``roles``."""
-    wanted, part = [system.roles[role] for role in roles], atlas.slice(at)
+def _over(atlas: Atlas, at: Mapping[str, float], *wanted: str) -> Atlas:
+    """``atlas`` restricted to ``at``, over exactly the parameters ``wanted``."""
+    part = atlas.slice(at)
     if set(part.parameters) != set(wanted):
         left = " and ".join(part.parameters) or "nothing"
         raise InputError(

@@ -158,14 +158,14 @@ def _atlas_answers(
     drawn = chart(path, {}, _CELLS if len(atlas.ranges) > 1 else _LINE_CELLS)
     speed, angle, damping = (atlas.scene.system.roles.get(name) for name in ("speed", "angle", "damping"))
     questions = {
-        frozenset({speed}): (speed_windows, {}),
-        frozenset({speed, damping}): (least_damping, {speed: atlas.ranges.get(str(speed))}),
-        frozenset({speed, angle}): (widest_angle, {speed: atlas.ranges.get(str(speed))}),
+        frozenset({speed}): speed_windows,
+        frozenset({speed, damping}): least_damping,
+        frozenset({speed, angle}): widest_angle,
     }
-    question, given = questions.get(frozenset(atlas.ranges), (None, {}))
+    question = questions.get(frozenset(atlas.ranges))
     if question is None:
         return [], drawn, False
-    reply = question(atlas, given, amplitude=amplitude, show=partial(_shown, atlas, convert(drawn)))
+    reply = question(atlas, {}, amplitude=amplitude, show=partial(_shown, atlas, convert(drawn)))
     return reply.sentences(), drawn, bool(reply.data.get("forced"))
 
 

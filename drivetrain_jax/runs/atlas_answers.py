@@ -97,8 +97,8 @@ class AtlasQuery:
         free: tuple[str, ...] = (),
         within: tuple[str, ...] = (),
     ) -> AtlasQuery:
-        """Check the given values; ``ranges`` names parameters that need a range, ``free`` those that are the answer, which a
-        range ``within`` the atlas may restrict."""
+        """Check the given values; ``ranges`` names parameters that have a range (default: that of the atlas), ``free`` those
+        that are the answer, which a range ``within`` the atlas may restrict."""
         given = {name: _plain(value) for name, value in given.items()}
         shaft, values = in_parameters(atlas.scene.system, given, atlas.scene.data)
         for name, value in given.items():
@@ -116,7 +116,8 @@ class AtlasQuery:
                 source = shaft.physical.source(name) if shaft and name not in given else ""
                 check_same(name, value, atlas.fixed[name], source)
         kept = {name for name in atlas.parameters if name not in free or name in within}
-        own = {name: _within(value, atlas.ranges[name]) for name, value in values.items() if name in kept}
+        own = {name: atlas.ranges[name] for name in ranges}
+        own |= {name: _within(value, atlas.ranges[name]) for name, value in values.items() if name in kept}
         backs = {name: shaft.back(name) for name in atlas.parameters if shaft and name not in given}
         seen = replace(atlas, views={name: back for name, back in backs.items() if back})
         for name in values:
@@ -312,26 +313,36 @@ def _result_rows(atlas: StoredAtlas, results: Mapping[str, Any], variables: Mapp
 
 
 def least_damping(
-    atlas: StoredAtlas, given: Mapping[str, float | Range], amplitude: Any = None, show: Show | None = None
+    atlas: StoredAtlas,
+    given: Mapping[str, float | Range],
+    amplitude: Any = None,
+    show: Show | None = None,
+    vary: str = "",
 ) -> Reply:
-    """The least damping above which a range of speeds is stable.
+    """The least damping, or the least value of another parameter to ``vary``, above which a range of speeds is stable.
 
-    If the largest damping of the atlas is unstable, the answer lists the stable ranges of damping. For a cardan shaft in
-    physical units the answer is ``c1``; of given dampings only the ratio ``c2/c1`` is used. Raises as :func:`query`.
+    Without a range it is that of the atlas. If the largest damping of the atlas is unstable, the answer lists the stable
+    ranges of damping. For a cardan shaft in physical units the answer is ``c1``; of given dampings only the ratio
+    ``c2/c1`` is used. Raises as :func:`query`.
     """
-    asked, answer = _limit("damping", design.least_damping, atlas, given, show)
-    return _answered("least damping", "from {} on", "largest", asked, answer, amplitude)
+    asked, answer = _limit("damping", design.least_damping, atlas, given, show, vary)
+    return _answered(f"least {vary or 'damping'}", "from {} on", "largest", asked, answer, amplitude)
 
 
 def widest_angle(
-    atlas: StoredAtlas, given: Mapping[str, float | Range], amplitude: Any = None, show: Show | None = None
+    atlas: StoredAtlas,
+    given: Mapping[str, float | Range],
+    amplitude: Any = None,
+    show: Show | None = None,
+    vary: str = "",
 ) -> Reply:
-    """The widest joint angle below which a range of speeds is stable.
+    """The widest joint angle, or the largest value of a parameter to ``vary``, below which a range of speeds is stable.
 
-    If the smallest angle of the atlas is unstable, the answer lists the stable ranges of angle. Raises as :func:`query`.
+    Without a range it is that of the atlas. If the smallest angle of the atlas is unstable, the answer lists the stable
+    ranges of angle. Raises as :func:`query`.
     """
-    asked, answer = _limit("angle", design.widest_angle, atlas, given, show)
-    return _answered("widest angle", "up to {}", "smallest", asked, answer, amplitude)
+    asked, answer = _limit("angle", design.widest_angle, atlas, given, show, vary)
+    return _answered(f"largest {vary}" if vary else "widest angle", "up to {}", "smallest", asked, answer, amplitude)
 
 
 def _limit(
@@ -340,12 +351,17 @@ def _limit(
     atlas: StoredAtlas,
     given: Mapping[str, float | Range],
     show: Show | None,
+    vary: str,
 ) -> tuple[AtlasQuery, design.Answer]:
-    """The limit of the parameter with this ``role`` within which a range of speeds is stable."""
-    speed, limited = roles_of(atlas, "speed", role)
+    """The limit of the parameter with this ``role``, or of ``vary``, within which a range of speeds is stable."""
+    (speed,) = roles_of(atlas, "speed")
+    shown = {quantity.name: name for name, (quantity, _) in atlas.viewed(given, (vary,)).views.items()}
+    limited = shown.get(vary, vary) or roles_of(atlas, role)[0]
+    if limited == speed:
+        raise InputError(f"vary = {vary!r}: is the speed; allowed is another parameter of the atlas")
     asked = replace(AtlasQuery.of(atlas, given, ranges=(speed,), free=(limited,)), show=show)
     panels, system = atlas.stability.atlas, atlas.scene.system
-    return asked, question(panels, system, asked.values[speed], asked.numbers(), direct=asked.direct)
+    return asked, question(panels, system, asked.values[speed], asked.numbers(), vary=limited, direct=asked.direct)
 
 
 def speed_windows(

@@ -129,6 +129,16 @@ def test_answers_begin_with_one_sentence_in_the_units_of_the_question():
     assert without.data["windows"] == [] and without.answer == windows.answer
     widest = atlas_answers.widest_angle(atlas, {**data, "speed": (290.0, 320.0)})
     assert widest.answer == "With angle = 6.09241 deg (beta = 0.106333) or less, speed = 290 to 320 rpm is stable."
+    whole = atlas_answers.widest_angle(atlas, {})
+    assert whole.data == atlas_answers.widest_angle(atlas, {"Omega": (1.3, 1.5)}).data
+    least = atlas_answers.least_damping(atlas, data, vary="angle")
+    assert least.data["parameter"] == "beta" and str(least).splitlines()[1].startswith(
+        "least angle, speed = 277.587 to"
+    )
+    assert least.data["intervals"][0]["ends"][1]["value"] == whole.data["value"] == pytest.approx(S21[0], abs=1e-8)
+    for vary, message in (("speed", "vary = 'speed': is the speed"), ("mu", "file: the atlas does not vary mu; ")):
+        with pytest.raises(dt.InputError, match=message):
+            atlas_answers.least_damping(atlas, data if vary == "speed" else {}, vary=vary)
     asked = json.loads(atlas_answers.query(atlas, {**data, "angle": 17.0, "speed": 302.3}).to_json())["answer"]
     assert (
         asked.startswith("Unstable; growth ") and " 3.23186 rpm below: speed = 299.068 rpm (Omega = 1.4006, " in asked
