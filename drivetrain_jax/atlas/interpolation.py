@@ -33,6 +33,16 @@ def analysis_matrix(n: int) -> np.ndarray:
     return matrix
 
 
+def restriction(n: int, lower: float, upper: float) -> np.ndarray:
+    """Matrix ``(n, n)`` from the coefficients of a polynomial over [-1, 1] to those over [lower, upper].
+
+    It is triangular; rounding errors elsewhere are set to 0.
+    """
+    y = nodes(n)
+    x = np.clip((lower * (1 - y) + upper * (1 + y)) / 2, -1.0, 1.0)
+    return np.triu(analysis_matrix(n) @ chebyshev(x, n))
+
+
 def tensor_nodes(degrees: Sequence[int]) -> np.ndarray:
     """All points of the tensor grid in [-1, 1]^d in C order, ``(prod(degrees), d)``."""
     grid = np.meshgrid(*(nodes(n) for n in degrees), indexing="ij")

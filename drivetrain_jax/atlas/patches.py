@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drivetrain_jax.atlas.criteria import Criteria
-from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes, on_grid
+from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes, on_grid, restriction
 from drivetrain_jax.atlas.panels import Panel, chebyshev, grid_positions, position_between
 
 # Nodes of a patch in each coordinate, tail of the series relative to its size, the multiple of it up to which a tail may be
@@ -300,9 +300,7 @@ def _enlargement(n: int) -> np.ndarray:
 @lru_cache
 def _restrictions(n: int) -> tuple[np.ndarray, np.ndarray]:
     """Matrices from the coefficients over [-1, 1] to those over the two parts left and right of the cut."""
-    t = nodes(n)
-    left, right = (_CUT - 1 + (1 + _CUT) * t) / 2, (1 + _CUT + (1 - _CUT) * t) / 2
-    return tuple(analysis_matrix(n) @ chebyshev(part, n) for part in (left, right))  # pyright: ignore[reportReturnType]
+    return restriction(n, -1.0, _CUT), restriction(n, _CUT, 1.0)
 
 
 # All zeros of a boundary function on a line, by exclusion of intervals.

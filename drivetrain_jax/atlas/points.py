@@ -16,8 +16,8 @@ from jax import Array
 from drivetrain_jax.analysis.floquet import quartic
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, in_one_kernel, options_for_few
 from drivetrain_jax.atlas.charts import Build, Cells, exact_verdict, in_threads, results_of_coefficients
-from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
-from drivetrain_jax.atlas.panels import Atlas, Panel, chebyshev, position
+from drivetrain_jax.atlas.interpolation import restriction
+from drivetrain_jax.atlas.panels import Atlas, Panel, position
 
 # Panels expanded on small boxes with few polynomials, for fast evaluation of scattered points.
 #
@@ -91,7 +91,7 @@ class Expansion:
         """R of every panel, coordinate and box."""
         return [
             [
-                [_restriction(n, *ends) for ends in pairwise(edges)]
+                [restriction(n, *ends) for ends in pairwise(edges)]
                 for n, edges in zip(panel.degrees, self._edges, strict=True)
             ]
             for panel in self._atlas.panels
@@ -129,13 +129,6 @@ class Expansion:
             float(sum(tail[min(n, len(tail) - 1)] for tail, n in zip(tails, self._degrees, strict=True)))
             for tails in self._tails
         ]
-
-
-def _restriction(n: int, lower: float, upper: float) -> np.ndarray:
-    """R for [lower, upper] and ``n`` polynomials. R is triangular; rounding errors elsewhere are set to 0."""
-    y = nodes(n)
-    x = np.clip((lower * (1 - y) + upper * (1 + y)) / 2, -1.0, 1.0)
-    return np.triu(analysis_matrix(n) @ chebyshev(x, n))
 
 
 # Points of a row, whose intermediate results fit into the cache, and rows of a block.

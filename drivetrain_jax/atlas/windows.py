@@ -12,8 +12,8 @@ import numpy as np
 
 from drivetrain_jax.atlas.criteria import Criteria, parameters_at
 from drivetrain_jax.atlas.exclusion import critical_points
-from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes
-from drivetrain_jax.atlas.panels import Atlas, Gap, Panel, chebyshev, position_between
+from drivetrain_jax.atlas.interpolation import restriction
+from drivetrain_jax.atlas.panels import Atlas, Gap, Panel, position_between
 from drivetrain_jax.atlas.patches import Patches, merge, on_line, patches_of, roots
 from drivetrain_jax.atlas.tips import polish, suspected
 from drivetrain_jax.systems import System
@@ -84,22 +84,33 @@ class Line:
 
 def stability_along(atlas: Atlas, system: type[System]) -> Line:
     """The intervals of stability along the one parameter of ``atlas`` (slice the others away)."""
-    folded = atlas.folded()
-    line = _along(folded, system)
-    return line if folded.lower[0] == atlas.lower[0] else _unfolded(line, float(atlas.lower[0]), float(atlas.upper[0]))
-
-
-def _along(atlas: Atlas, system: type[System]) -> Line:
-    criteria = Criteria.of(atlas, system)
-    changes, undecided = [], []
+    part, (lower, upper) = atlas.folded(), (float(atlas.lower[0]), float(atlas.upper[0]))
+    criteria = Criteria.of(part, system)
+    changes, undecided = [], [_values(part, np.stack([gap.lower, gap.upper])[:, 0], 0) for gap in part.gaps]
     for kind, patches in zip(criteria.multipliers, patches_of(criteria), strict=True):
         found = roots(patches)
-        changes += _crossings(atlas, found.x[:, None], found.error, 0, kind)
-        undecided += [tuple(sorted(map(float, parameters_at(atlas, i[:, None])[:, 0]))) for i in found.undecided]
-    undecided += [
-        tuple(sorted(map(float, parameters_at(atlas, np.stack([g.lower, g.upper]))[:, 0]))) for g in atlas.gaps
-    ]
-    return _line(atlas.parameters[0], (atlas.lower[0], atlas.upper[0]), changes, undecided, _stable_at(criteria))
+        changes += _crossings(part, found.x[:, None], found.error, 0, kind)
+        undecided += [_values(part, ends, 0) for ends in found.undecided]
+    if lower < part.lower[0]:
+        # Both signs of the parameter have the same results.
+        changes += [
+            replace(c, value=-c.value, point={name: -value for name, value in c.point.items()}) for c in changes
+        ]
+        undecided = [(max(a, lower), min(b, upper)) for low, high in undecided for a, b in ((low, high), (-high, -low))]
+        undecided = [(a, b) for a, b in undecided if a <= b]
+
+    def stable(values: np.ndarray) -> np.ndarray:
+        return criteria.stable(part.to_coordinates(values[:, None]))
+
+    return _line(part.parameters[0], (lower, upper), changes, undecided, stable)
+
+
+def _values(atlas: Atlas, ends: np.ndarray, k: int) -> Range:
+    """An interval ``(2,)`` of the coordinate ``k`` as a range of its parameter."""
+    x = np.tile(atlas.corners[0], (2, 1))
+    x[:, k] = ends
+    low, high = sorted(map(float, parameters_at(atlas, x)[:, k]))
+    return low, high
 
 
 def stability_over_range(atlas: Atlas, system: type[System], along: str) -> Line:
@@ -126,16 +137,13 @@ def stability_over_range(atlas: Atlas, system: type[System], along: str) -> Line
             # Without an error of their own: `_one_change` takes the undecided range as their error.
             suspects += _crossings(atlas, likely, np.zeros(len(likely)), v, kind)
         changes += _crossings(atlas, x, error, v, kind)
-        undecided += [tuple(sorted(map(float, parameters_at(atlas, box)[:, v]))) for box in search.undecided]
+        undecided += [_values(atlas, box[:, v], v) for box in search.undecided]
         for end in atlas.ends[:, h]:
             rim = roots(on_line(patches[number], h, float(end)))
             x = np.insert(rim.x[:, None], h, end, axis=1)
             changes += _crossings(atlas, x, rim.error, v, kind)
-            ends = parameters_at(atlas, np.insert(rim.undecided[..., None], h, end, axis=2))[..., v]
-            undecided += [tuple(sorted(map(float, pair))) for pair in ends]
-    undecided += [
-        tuple(sorted(map(float, parameters_at(atlas, np.stack([g.lower, g.upper]))[:, v]))) for g in atlas.gaps
-    ]
+            undecided += [_values(atlas, ends, v) for ends in rim.undecided]
+    undecided += [_values(atlas, np.stack([gap.lower, gap.upper])[:, v], v) for gap in atlas.gaps]
 
     def stable(values: np.ndarray) -> np.ndarray:
         return np.array([_all_stable(criteria, patches, h, value) for value in values])
@@ -171,11 +179,10 @@ def _part(box: Panel | Gap, lower: np.ndarray, upper: np.ndarray) -> Panel | Gap
         return replace(box, lower=low, upper=high)
     coefficients = box.coefficients
     for k, n in enumerate(box.degrees):
-        y = nodes(n)
-        t = position_between(box.lower[k], box.upper[k], (low[k] * (1 - y) + high[k] * (1 + y)) / 2)
-        matrix = analysis_matrix(n) @ chebyshev(t, n)
+        matrix = restriction(n, *position_between(box.lower[k], box.upper[k], np.array([low[k], high[k]])))
         coefficients = np.moveaxis(np.tensordot(matrix, coefficients, axes=(1, k)), 0, k)
-    return replace(box, lower=low, upper=high, coefficients=coefficients)
+    # The proof does not cover the rounding of these products.
+    return replace(box, lower=low, upper=high, coefficients=coefficients, proved_error=math.inf)
 
 
 def _crossings(atlas: Atlas, x: np.ndarray, error: np.ndarray, v: int, kind: str) -> list[Crossing]:
@@ -188,13 +195,6 @@ def _crossings(atlas: Atlas, x: np.ndarray, error: np.ndarray, v: int, kind: str
         for p, e in zip(points, errors, strict=True)
         if np.isfinite(p).all()
     ]
-
-
-def _stable_at(criteria: Criteria):
-    def stable(values: np.ndarray) -> np.ndarray:
-        return criteria.stable(criteria.atlas.to_coordinates(values[:, None]))
-
-    return stable
 
 
 def _all_stable(criteria: Criteria, patches: tuple[Patches, ...], h: int, value: float) -> bool:
@@ -293,40 +293,3 @@ def _end(change: Crossing) -> tuple[float, float]:
 def _least(lower: tuple[float, float], upper: tuple[float, float]) -> float:
     """Largest width of a part between two candidates (values, bounds of errors) that is not tested."""
     return _WIDER * max(lower[1], upper[1], np.finfo(float).eps * max(abs(lower[0]), abs(upper[0])))
-
-
-def _unfolded(line: Line, lower: float, upper: float) -> Line:
-    """A line over moduli as a line over the parameter from ``lower``, which is negative, to ``upper``."""
-    negative = [_mirrored(interval) for interval in reversed(line.intervals)]
-    both = [*negative, *line.intervals] if upper > 0 else negative
-    parts = [part for interval in both if (part := _clipped(interval, lower, upper)) is not None]
-    joined: list[Interval] = []
-    for part in parts:
-        # Nothing changes at 0, or across an undecided range around it.
-        if joined and joined[-1].upper == -part.lower:
-            last = joined.pop()
-            part = replace(part, lower=last.lower, lower_end=last.lower_end)
-        joined.append(part)
-    ranges = [(-b, -a) for a, b in line.undecided] + (list(line.undecided) if upper > 0 else [])
-    undecided = [(max(a, lower), min(b, upper)) for a, b in ranges if a <= upper and b >= lower]
-    return Line(line.parameter, tuple(joined), tuple(sorted(undecided)))
-
-
-def _mirrored(interval: Interval) -> Interval:
-    ends = [_opposite(end) for end in (interval.upper_end, interval.lower_end)]
-    return Interval(-interval.upper, -interval.lower, interval.stable, *ends)
-
-
-def _opposite(crossing: Crossing | None) -> Crossing | None:
-    if crossing is None:
-        return None
-    return replace(crossing, value=-crossing.value, point={name: -value for name, value in crossing.point.items()})
-
-
-def _clipped(interval: Interval, lower: float, upper: float) -> Interval | None:
-    """The part of ``interval`` from ``lower`` to ``upper``; None without one."""
-    if interval.upper <= lower or interval.lower >= upper:
-        return None
-    if interval.lower < lower:
-        interval = replace(interval, lower=lower, lower_end=None)
-    return replace(interval, upper=upper, upper_end=None) if interval.upper > upper else interval
