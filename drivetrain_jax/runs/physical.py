@@ -51,8 +51,12 @@ def with_parameters(
         if not isinstance(value, Along)
     }
     others = {name: value for name, value in fixed.items() if name not in physical.names}
-    data = {name: value for name, value in {**fixed, **everything}.items() if name in physical.names}
+    data = {name: x for name, x in {**fixed, **everything}.items() if name in physical.names and not _varies(x)}
     return _converted_axes(system, axes, zipped, swept, found), others | constant, data
+
+
+def _varies(value: Any) -> bool:
+    return isinstance(value, Along) or (isinstance(value, tuple) and any(map(_varies, value)))
 
 
 def _known(system: type[System], axes: tuple[Axis, ...], zipped: bool, fixed: Mapping[str, Any]) -> dict[str, Any]:

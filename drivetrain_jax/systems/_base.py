@@ -185,7 +185,7 @@ def _evaluated(conversion: Conversion, needs: list[Any]) -> Any:
     value = conversion.value(*(need.values if isinstance(need, Along) else need for need in needs))
     if axes:
         return Along(axes[0], np.asarray(value, float))
-    return value if isinstance(value, (str, jax.core.Tracer)) or np.ndim(value) else float(value)
+    return value if isinstance(value, (str, jax.core.Tracer, Along)) or np.ndim(value) else float(value)
 
 
 Method = TypeVar("Method", bound=Callable[..., Any])

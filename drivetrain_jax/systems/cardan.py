@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -46,6 +47,7 @@ from drivetrain_jax.systems._models import (
     Series,
     Smoothness,
 )
+from drivetrain_jax.systems.bicardan import MATERIALS, ring_power
 from drivetrain_jax.systems.cardan_bounds import BALANCE, ENCLOSURE
 
 # Clock of the reduced equations, and predicted numbers of steps in this clock.
@@ -123,6 +125,38 @@ def _unit_of_damping(j1: Any, k1: Any) -> Any:
     return 2 * xp.sqrt(k1) * xp.sqrt(j1)
 
 
+def _entry(position: int, stiffness: tuple[Any, ...]) -> Any:
+    """The stiffness of the driving (0) or of the driven shaft (1)."""
+    if len(stiffness) != 2:
+        raise InputError(f"length: got {len(stiffness)} shafts; allowed are two, the driving and the driven one")
+    return stiffness[position]
+
+
+_EACH: dict[str, Any] = {"listed": True, "broadcast": True}
+# Tubes as shafts, one entry each.
+TUBES = (
+    Parameter("outer_diameter", "m", "outer diameters of the shafts", usual=10.0, **POSITIVE, **_EACH),
+    Parameter("inner_diameter", "m", "bores of the shafts", default=0.0, usual=10.0, lower=0.0, **_EACH),
+    Parameter("length", "m", "lengths of the shafts", usual=100.0, listed=True, **POSITIVE),
+    Parameter("material", "1", "material of all shafts: G", choices=tuple(MATERIALS)),
+    Parameter("G", "Pa", "shear modulus of the shafts", **POSITIVE, **_EACH),
+)
+
+
+def stiffness_of_tubes(name: str, replaceable: bool = False) -> tuple[Conversion, ...]:
+    """The conversions of ``TUBES`` to the list of stiffnesses ``name``."""
+    return (
+        Conversion("G", ("material",), lambda word: MATERIALS[word][1], "that of the material", optional=True),
+        Conversion(
+            name,
+            ("outer_diameter", "inner_diameter", "length", "G"),
+            lambda outer, inner, length, g: math.pi / 32 * g * ring_power(outer, inner, 4) / length,
+            "pi/32 G (outer_diameter^4 - inner_diameter^4)/length",
+            replaceable=replaceable,
+        ),
+    )
+
+
 PHYSICAL = PhysicalData(
     (
         Parameter("J1", "kg m2", "inertia of the driving disk", **POSITIVE),
@@ -133,8 +167,13 @@ PHYSICAL = PhysicalData(
         Parameter("c2", "N m s/rad", "damping of the driven shaft", lower=0.0),
         Parameter("speed", "rpm", "speed of the driving shaft", **POSITIVE),
         Parameter("angle", "deg", "joint angle", lower=-90.0, upper=90.0, open_lower=True, open_upper=True),
+        *TUBES,
+        Parameter("stiffness", "N m/rad", "stiffnesses of the shafts, driving and driven", listed=True, **POSITIVE),
     ),
     (
+        *stiffness_of_tubes("stiffness", replaceable=True),
+        Conversion("k1", ("stiffness",), partial(_entry, 0), "stiffness[0]", replaceable=True, whole=("stiffness",)),
+        Conversion("k2", ("stiffness",), partial(_entry, 1), "stiffness[1]", replaceable=True, whole=("stiffness",)),
         Conversion("beta", ("angle",), _radians, "angle", np.degrees),
         Conversion(
             "Omega",

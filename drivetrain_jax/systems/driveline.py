@@ -23,12 +23,11 @@ from jax import Array
 from jax.tree_util import Partial
 
 from drivetrain_jax._errors import counted
-from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
+from drivetrain_jax._quantities import Component, Dimension, Variable
 from drivetrain_jax.resonances import DRIVELINE
 from drivetrain_jax.systems._base import (
     POSITIVE,
     RPM,
-    Conversion,
     Number,
     PhysicalData,
     System,
@@ -47,8 +46,7 @@ from drivetrain_jax.systems._models import (
     SpringSystem,
     weighted_factor,
 )
-from drivetrain_jax.systems.bicardan import MATERIALS, ring_power
-from drivetrain_jax.systems.cardan import speed_ratio
+from drivetrain_jax.systems.cardan import TUBES, speed_ratio, stiffness_of_tubes
 
 Components = Sequence[Any]
 # A list is also an array, and each entry a number, an array of lanes, or a text such as "41/11".
@@ -325,25 +323,7 @@ def phasing_sentence(values: Values, parameters: Values) -> str:
 
 
 _CHAIN = ("speed", *_LISTS)
-_EACH: dict[str, Any] = {"listed": True, "broadcast": True}
-PHYSICAL = PhysicalData(
-    (
-        Parameter("outer_diameter", "m", "outer diameters of the shafts", usual=10.0, **POSITIVE, **_EACH),
-        Parameter("inner_diameter", "m", "bores of the shafts", default=0.0, usual=10.0, lower=0.0, **_EACH),
-        Parameter("length", "m", "lengths of the shafts", usual=100.0, listed=True, **POSITIVE),
-        Parameter("material", "1", "material of all shafts: G", choices=tuple(MATERIALS)),
-        Parameter("G", "Pa", "shear modulus of the shafts", **POSITIVE, **_EACH),
-    ),
-    (
-        Conversion("G", ("material",), lambda name: MATERIALS[name][1], "that of the material", optional=True),
-        Conversion(
-            "k",
-            ("outer_diameter", "inner_diameter", "length", "G"),
-            lambda outer, inner, length, g: math.pi / 32 * g * ring_power(outer, inner, 4) / length,
-            "pi/32 G (outer_diameter^4 - inner_diameter^4)/length",
-        ),
-    ),
-)
+PHYSICAL = PhysicalData(TUBES, stiffness_of_tubes("k"))
 
 SHAFT = Dimension("shaft", "number of the shaft from the driven end", ())
 _LIST = {"listed": True, "lower": 0.0}

@@ -18,8 +18,17 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax._quantities import Component, Variable
-from drivetrain_jax.systems._base import POSITIVE, Number, System, Values, parameter, serves
+from drivetrain_jax._quantities import Component, Parameter, Variable
+from drivetrain_jax.systems._base import (
+    POSITIVE,
+    Conversion,
+    Number,
+    PhysicalData,
+    System,
+    Values,
+    parameter,
+    serves,
+)
 from drivetrain_jax.systems._models import Components, FloquetModel, Flow, LinearPeriodic, Rows, cos, sin
 
 # Default parameters from tables 1, 2 and 4 of the paper, and conflicts between them.
@@ -388,6 +397,10 @@ class Tripod(System):
     title = "Double-tripod driveshaft"
     source = "Bugaru & Vasile, Applied Sciences 12(12), 6182, 2022; corrections in docs/theory/tripod.md"
     time_units = "s"
+    physical = PhysicalData(
+        (Parameter("speed", "rpm", "speed of the shaft; moments of area repeat twice a turn", **POSITIVE),),
+        (Conversion("excitation_frequency", ("speed",), lambda rpm: rpm / 30, "2 speed", lambda f: f * 30),),
+    )
     roles = MappingProxyType({"speed": "excitation_frequency", "angle": "beta", "damping": "zeta"})
     state = (
         Component("phi", "rad", "twist"),

@@ -11,6 +11,7 @@ import pytest
 import xarray as xr
 
 import drivetrain_jax as dt
+from drivetrain_jax.runs.physical import in_parameters
 from drivetrain_jax.runs.scene import load_scene
 
 # A truck's propeller shaft.
@@ -176,6 +177,27 @@ def test_two_gears_move_as_the_oscillator():
 
 
 @pytest.mark.full
+def test_tubes_are_stiffnesses_and_turns_excite_twice():
+    tube = [math.pi / 32 * 2.1e11 / 2.6 * (0.09**4 - 0.08**4) / length for length in (1.2, 0.8)]
+    data = {name: value for name, value in TRUCK.items() if name not in ("k1", "k2")} | {"angle": 12.0, "speed": 2000.0}
+    tubes = {"outer_diameter": "90 mm", "inner_diameter": "80 mm", "length": ["1200 mm", 0.8], "material": "steel"}
+    found = dt.Cardan.from_physical(**data, **tubes).values
+    exact = dt.Cardan.from_physical(**data, k1=tube[0], k2=tube[1]).values
+    assert found == pytest.approx(exact, rel=1e-14)
+    scene = load_scene(
+        cardan(axes={"outer_diameter[1]": ["85 mm", "90 mm"]}, fixed=data | tubes | {"outer_diameter": [0.09, 0.09]})
+    )
+    assert scene.axes[0].name == "mu" and scene.axes[0].values[1] == pytest.approx(1.5, rel=1e-14)
+    assert scene.data["length"] == (1.2, 0.8) and "k2" not in scene.data
+    given, values = in_parameters(dt.Cardan, {"speed": 1000.0}, load_scene(cardan(axes={}, fixed=data | tubes)).data)
+    assert given.quantity("mu", 1.5)[1] == pytest.approx(tube[1], rel=1e-14)
+    assert values["Omega"] == pytest.approx(exact["Omega"] / 2, rel=1e-14)
+    with pytest.raises(dt.InputError, match="length: got 3 shafts; allowed are two, the driving and the driven one"):
+        dt.Cardan.from_physical(**data, **tubes | {"length": [1.0, 1.0, 1.0]})
+    shaft = dt.Tripod.from_physical(element="input", beta=0.157, zeta=0.002, speed=1200.0)
+    assert shaft.excitation_frequency == 40.0
+
+
 def test_a_frequency_response_over_the_speed():
     scene = {"system": "rattle", "analysis": "frequency_response", "fixed": GEARS, "outputs": ["u_max"]}
     found = dt.run({**scene, "axes": {"speed": {"start": 600, "stop": 6000, "num": 5}}})
