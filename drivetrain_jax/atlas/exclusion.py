@@ -118,7 +118,7 @@ class _Bundle:
     def single(self) -> np.ndarray:
         """Boxes with exactly one zero."""
         sign, bend = self._bend()
-        left, right = (sign * self._line(self.f_h, self.h, np.full(len(sign), t)) for t in (-1.0, 1.0))
+        left, right = (sign * self.f_h.restrict(self.h, np.full(len(sign), t)).coefficients for t in (-1.0, 1.0))
         inside = (_highest(left) + self.f_h.error < 0) & (_highest(-right) + self.f_h.error < 0)
         low, high = self.f_v.range()
         one_way = (low > 0) | (high < 0)
@@ -141,15 +141,10 @@ class _Bundle:
         """Coefficients in v of sign f and of f_h on the line h = const along which f_h is about 0."""
         width = self.f.upper[:, self.h] - self.f.lower[:, self.h]
         middle = np.zeros(len(self.f))
-        first, second = (self._line(p, self.h, middle)[0] for p in (self.f_h, self.f_hh))
+        first, second = (p.restrict(self.h, middle).coefficients[0] for p in (self.f_h, self.f_hh))
         with np.errstate(all="ignore"):
             t = np.clip(np.nan_to_num(-first / second * 2 / width), -1.0, 1.0)
-        return sign * self._line(self.f, self.h, t), self._line(self.f_h, self.h, t)
-
-    def _line(self, patches: Patches, axis: int, t: np.ndarray) -> np.ndarray:
-        """Coefficients along the other coordinate on the line where ``axis`` is at ``t``, ``(n, N)``."""
-        basis = np.cos(np.arange(patches.coefficients.shape[axis])[:, None] * np.arccos(t))
-        return np.einsum("ab...,a...->b..." if axis == 0 else "ba...,a...->b...", patches.coefficients, basis)
+        return sign * self.f.restrict(self.h, t).coefficients, self.f_h.restrict(self.h, t).coefficients
 
     def root(self) -> tuple[np.ndarray, ...]:
         """The zero of each box by Newton's method on the patches, f_hh and f_v there, and the boxes ``(N, 2, 2)``."""

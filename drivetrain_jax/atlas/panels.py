@@ -272,24 +272,17 @@ def from_arrays(
     sizes = np.prod(degrees, axis=1, dtype=int)
     kept = np.unpackbits(np.asarray(arrays["kept"]), count=int(sizes.sum())).astype(bool)
     coefficients = np.asarray(arrays["coefficients"], float)
+    dense = np.zeros((len(kept), coefficients.shape[1]))
+    dense[kept] = coefficients
     proved = np.asarray(arrays.get("proved_error", ()))
-    proved = proved if proved.size else np.full(len(sizes), math.inf)
-    panels, first, used = [], 0, 0
-    for k, size in enumerate(sizes):
-        mask = kept[first : first + size]
-        dense = np.zeros((size, coefficients.shape[1]))
-        count = int(mask.sum())
-        dense[mask] = coefficients[used : used + count]
-        first, used = first + size, used + count
-        panels.append(
-            Panel(
-                np.asarray(arrays["panel_lower"][k]),
-                np.asarray(arrays["panel_upper"][k]),
-                dense.reshape(*degrees[k], -1),
-                float(arrays["value_error"][k]),
-                float(proved[k]),
-            )
+    columns = arrays["panel_lower"], arrays["panel_upper"], arrays.get("value_error", ())
+    parts = np.split(dense, np.cumsum(sizes)[:-1]) if len(sizes) else []
+    panels = [
+        Panel(np.asarray(lower), np.asarray(upper), part.reshape(*n, -1), float(error), float(bound))
+        for lower, upper, error, bound, part, n in zip(
+            *columns, proved if proved.size else np.full(len(sizes), math.inf), parts, degrees, strict=True
         )
+    ]
     gaps = [
         Gap(np.asarray(lower), np.asarray(upper), str(reason))
         for lower, upper, reason in zip(arrays["gap_lower"], arrays["gap_upper"], arrays["gap_reason"], strict=True)

@@ -129,7 +129,7 @@ class Patches:
 
         def contract(c: np.ndarray) -> np.ndarray:
             weights = np.cos(np.arange(c.shape[axis])[:, None] * np.arccos(np.clip(t, -1.0, 1.0)))
-            return (np.moveaxis(c, axis, 0) * weights.reshape(len(weights), *(1,) * (c.ndim - 2), -1)).sum(axis=0)
+            return np.einsum("i...n,in->...n", np.moveaxis(c, axis, 0), weights)
 
         return Patches(
             np.delete(self.lower, axis, axis=1),

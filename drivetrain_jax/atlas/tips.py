@@ -30,81 +30,53 @@ from drivetrain_jax.systems import Resonances, System
 
 _STEPS = 60
 _NEWTON = 4
-# Numbers of the two criteria that bound the tongue of a multiplier.
-_EDGES = {MINUS: (0, 1), PLUS: (2, 3)}
-_PAIR = 4
+# Numbers of the criteria that bound the tongue of a multiplier: two edges, or the discriminant.
+_EDGES = {MINUS: (0, 1), PLUS: (2, 3), PAIR: (4,)}
 
 
-def undamped_tips(criteria: Criteria, horizontal: int, resonances: Resonances) -> list[tuple]:
-    """(name, multiplier, parameters) of every resonance from which a tongue of resolved width grows.
+def undamped_tips(criteria: Criteria, horizontal: int, resonances: Resonances) -> list[Tip]:
+    """The tips of all tongues of resolved width: the resonances from which they grow.
 
     The resonances are at the angle 0; an atlas that does not start there has none.
     """
     atlas, h, v = criteria.atlas, horizontal, 1 - horizontal
     if atlas.parameters[v] != criteria.system.roles.get("angle", atlas.parameters[v]) or atlas.lower[v] > 0:
         return []
-    lower, upper = atlas.lower[h], atlas.upper[h]
     values = np.asarray(resonances.values({**dict.fromkeys(atlas.parameters, np.nan), **atlas.fixed}))
-    patches = patches_of(criteria)
-    found = []
+    patches, end = patches_of(criteria), float(atlas.to_coordinates(atlas.upper)[v])
+    found, exactly = [], dict.fromkeys(atlas.parameters, 0.0)
     for label, kind, speed in zip(resonances.labels, resonances.multipliers, values, strict=True):
-        if not lower <= speed <= upper:
-            continue
         point = atlas.lower.copy()
         point[h] = speed
-        start = atlas.to_coordinates(point)
-        end = float(atlas.to_coordinates(atlas.upper)[v])
-        if kind == PAIR:
-            grows = _collides(patches[_PAIR], start, end, h)
-        else:
-            grows = _separates([patches[k] for k in _EDGES[kind]], start, end, h)
-        if grows:
-            found.append((label, kind, point))
+        inside = atlas.lower[h] <= speed <= atlas.upper[h]
+        if inside and _grows([patches[k] for k in _EDGES[kind]], atlas.to_coordinates(point), end, h):
+            found.append(Tip(label, kind, dict(zip(atlas.parameters, map(float, point), strict=True)), exactly, True))
     return found
 
 
-def _ascend(start: np.ndarray, end: float, v: int) -> np.ndarray:
-    """Points above the foot, ``(steps, 2)``, with the coordinate v rising quadratically."""
-    fraction = (np.arange(1, _STEPS + 1) / _STEPS) ** 2
-    x = np.repeat(start[None], _STEPS, axis=0)
-    x[:, v] += (end - start[v]) * fraction
-    return x
+def _grows(functions: Sequence[Patches], start: np.ndarray, end: float, h: int) -> bool:
+    """True if the tongue above ``start`` opens by more than the errors.
 
-
-def _separates(edges: list[Patches], start: np.ndarray, end: float, h: int) -> bool:
-    """True if the zeros of the two functions along h, followed from ``start``, separate by more than their errors."""
-    positions = np.full(2, start[h])
-    slopes = [edge.derivative(h) for edge in edges]
-    for x in _ascend(start, end, 1 - h):
-        errors = np.empty(2)
-        for k, (edge, slope) in enumerate(zip(edges, slopes, strict=True)):
+    The zeros of two functions along h, its edges, separate; or a single function becomes negative on its ridge.
+    """
+    edges = len(functions) > 1
+    followed = functions if edges else [functions[0].derivative(h)]
+    slopes = [each.derivative(h) for each in followed]
+    x = np.tile(start, (len(functions), 1))
+    # The other coordinate rises quadratically.
+    for fraction in (np.arange(1, _STEPS + 1) / _STEPS) ** 2:
+        x[:, 1 - h] = start[1 - h] + (end - start[1 - h]) * fraction
+        reach = 0.0
+        for k, (function, slope) in enumerate(zip(followed, slopes, strict=True)):
             for _ in range(_NEWTON):
-                x[h] = positions[k]
-                place = edge.locate(x[None])
+                place = function.locate(x[k : k + 1])
                 rate = slope.at(*place)[0]
-                positions[k] -= edge.at(*place)[0] / rate
-            errors[k] = edge.error[place[0][0]] / abs(rate)
-        if not np.isfinite(positions).all():
+                x[k, h] -= function.at(*place)[0] / rate
+            reach += functions[k].error[place[0][0]] / abs(rate)
+        if not np.isfinite(x).all() or not (edges or rate > 0):
             return False
-        if abs(positions[0] - positions[1]) > errors.sum():
-            return True
-    return False
-
-
-def _collides(discriminant: Patches, start: np.ndarray, end: float, h: int) -> bool:
-    """True if the discriminant on the ridge above ``start`` becomes negative by more than its error."""
-    slope = discriminant.derivative(h)
-    curvature = slope.derivative(h)
-    position = start[h]
-    for x in _ascend(start, end, 1 - h):
-        for _ in range(_NEWTON):
-            x[h] = position
-            place = discriminant.locate(x[None])
-            position = position - slope.at(*place)[0] / curvature.at(*place)[0]
-        value = discriminant.at(*place)[0]
-        if not (np.isfinite(position) and curvature.at(*place)[0] > 0):
-            return False
-        if value < -discriminant.error[place[0][0]]:
+        place = functions[0].locate(x[:1])
+        if np.ptp(x[:, h]) > reach if edges else functions[0].at(*place)[0] < -functions[0].error[place[0][0]]:
             return True
     return False
 
@@ -175,7 +147,7 @@ def find_tips(atlas: Atlas, system: type[System], *, opening: bool = True) -> Ti
     horizontal = _axis_of_resonances(atlas, system)
     criteria = Criteria.of(atlas, system)
     if criteria.conservative:
-        undamped = tuple(_named(t, atlas) for t in undamped_tips(criteria, horizontal, _predictions(atlas, system)))
+        undamped = undamped_tips(criteria, horizontal, _predictions(atlas, system))
         return Tips(_sorted(undamped, atlas, horizontal), ())
     patches = patches_of(criteria)
     searches = tuple(critical_points(patches, k, horizontal) for k in range(len(patches)))
@@ -330,12 +302,6 @@ def _name(atlas: Atlas, system: type[System], kind: str, x: np.ndarray) -> str:
     first, second = np.argsort(distance)[:2]
     clear = distance[first] < _NEAR and distance[second] > _CLEAR * distance[first]
     return resonances.labels[first] if clear else ""
-
-
-def _named(tip: tuple, atlas: Atlas) -> Tip:
-    name, kind, point = tip
-    nothing = dict.fromkeys(atlas.parameters, 0.0)
-    return Tip(name, kind, dict(zip(atlas.parameters, map(float, point), strict=True)), nothing, True)
 
 
 def _box(atlas: Atlas, box: np.ndarray) -> Box:
