@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import subprocess
@@ -314,6 +315,14 @@ def test_any_function_is_swept_resumed_and_refused(tmp_path):
     assert dt.sweep(one(2.0), pytree, over=over, out=out, fresh=True).root[1, 1] == 12.0
 
 
+def test_help_and_results_show_what_they_hold():
+    text = inspect.getdoc(dt.Cardan) or ""
+    assert "zeta: damping ratio of the driving shaft; 0 <= zeta < inf; required." in text
+    assert "theta1_0: twist of the driving shaft at tau = 0; -inf < theta1_0 < inf, in rad; default 0.0." in text
+    assert repr(dt.Result({"z": jnp.array([1 + 2j, 3.0])})) == "Result(z=[(1+2j), (3+0j)])"
+    assert repr(dt.Result({"z": jnp.ones(9, complex)})) == "Result(z=c128[9])"
+
+
 def test_registered_classes_are_known_by_name(tmp_path, monkeypatch):
     """Until another one of this name replaces them; classes without a file, as in a notebook, do not share results."""
     monkeypatch.setattr(systems, "_REGISTERED", {})
@@ -421,6 +430,7 @@ assert found.dtype == "float64" and abs(found - 1.0319354931451954) < 1e-9, foun
 @pytest.mark.full
 def test_who_embeds_the_package_may_keep_single_precision():
     code = """
+import inspect
 import os
 os.environ["DRIVETRAIN_JAX_ENABLE_X64"] = "0"
 import jax, drivetrain_jax as dt

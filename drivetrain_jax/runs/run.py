@@ -37,7 +37,7 @@ class Interrupted(KeyboardInterrupt):
     """Raised when the user interrupts a run; finished blocks are kept. ``progress`` holds the counts."""
 
     def __init__(self, progress: Progress) -> None:
-        super().__init__("interrupted")
+        super().__init__("interrupted; the same call resumes")
         self.progress = progress
 
 

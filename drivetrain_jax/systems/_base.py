@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from dataclasses import fields as dataclass_fields
 from decimal import Decimal
 from functools import partial
+from inspect import cleandoc
 from numbers import Complex
 from os import PathLike
 from types import MappingProxyType
@@ -318,6 +319,13 @@ class System(eqx.Module):
             if name not in fields and "ClassVar" not in str(kind):
                 raise TypeError(f"{cls.__name__}.{name}: not a parameter; allowed is {name}: Any = parameter(...)")
         cls.parameters += tuple(replace(m[_PARAMETER], name=name) for name, m in fields.items() if _PARAMETER in m)
+        # For `help`: meaning, range, unit and default of each parameter; the signature has None where there is no default.
+        about = []
+        for p in cls.parameters:
+            value = p.derived or ("none" if p.default == () else p.default)
+            default = "required" if value is None else f"default {value}"
+            about.append(f"    {p.name}: {p.long_name}; {p.allowed_in_units}; {default}.")
+        cls.__doc__ = "\n".join([cleandoc(body.get("__doc__") or cls.title), "", "Args:", *about])
         if "models" not in body:
             cls.models = dict(cls.models) | {a: m for method in body.values() for a, m in _models(cls, method).items()}
         _check_names(cls)
@@ -477,11 +485,17 @@ def _number(described: Parameter, value: Any) -> Any:
     return value if whole.dtype.kind == "f" else whole.astype(float)
 
 
+# Most complex numbers that are printed: the multipliers of a point.
+_FEW = 8
+
+
 def printed(tree: Any) -> str:
-    """The text of ``tree`` with values for arrays of one number, which Equinox prints without, and shapes for others."""
+    """The text of ``tree`` with the values of arrays of one number and of few complex numbers, and the shapes of others."""
 
     def number(leaf: Any) -> Any:
-        single = isinstance(leaf, jax.Array) and not isinstance(leaf, jax.core.Tracer) and leaf.ndim == 0
-        return leaf.item() if single else leaf
+        if not isinstance(leaf, jax.Array) or isinstance(leaf, jax.core.Tracer):
+            return leaf
+        few = leaf.ndim == 1 and leaf.size <= _FEW and jnp.iscomplexobj(leaf)
+        return leaf.tolist() if few or leaf.ndim == 0 else leaf
 
     return eqx.tree_pformat(jax.tree.map(number, tree))

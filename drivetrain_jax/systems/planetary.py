@@ -407,6 +407,10 @@ def check(fixed: Mapping[str, Any]) -> None:
     angles = fixed.get("planet_angle")
     if angles is not None and all(isinstance(angle, (int, float)) for angle in angles):
         apart = [math.remainder(a - b, 2 * math.pi) for i, a in enumerate(angles) for b in angles[:i]]
+        if len(angles) > 2 and all(abs(gap) < 1e-9 for gap in apart):
+            raise ValueError(
+                f"planet_angle = {list(angles)}: all planets are in one place; allowed are different angles"
+            )
         if any(abs(gap) < 1e-9 for gap in apart):
             warnings.warn(f"planet_angle = {list(angles)}: several planets are in one place", stacklevel=2)
     for name in (*PER_PLANET, *ERRORS):

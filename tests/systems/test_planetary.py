@@ -53,6 +53,13 @@ def test_planets_in_one_place_are_warned_of(angles):
         load_scene(SCENE | {"fixed": {"planet_angle": list(angles)}})
 
 
+def test_planets_that_are_all_in_one_place_are_refused():
+    with pytest.raises(
+        InputError, match=r"planet_angle = \[0.0, 0.0, 0.0\]: all planets are in one place; allowed are"
+    ):
+        load_scene(SCENE | {"fixed": {"planet_angle": [0.0, 0.0, 0.0]}})
+
+
 @pytest.mark.parametrize("model", full_after(1, ["rotational", "plane"]))
 def test_the_vector_field_is_that_of_the_equations_of_motion(model):
     gear = dt.Planetary(planet_angle=(0.0, 1.3, 3.3), **LISTS, **HELD, k_sx=2e8, model=model)
