@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         phasing,
         poincare,
         steady_state,
+        whirl,
     )
     from drivetrain_jax.datasets.figure import plot
     from drivetrain_jax.runs.atlas_file import open_atlas
@@ -97,6 +98,7 @@ __all__ = [
     "run",
     "steady_state",
     "sweep",
+    "whirl",
 ]
 
 

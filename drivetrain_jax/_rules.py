@@ -6,6 +6,7 @@ NaN obeys every rule.
 from __future__ import annotations
 
 import itertools
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -192,6 +193,14 @@ def _sum_rule(ds: xr.Dataset) -> xr.DataArray:
     return (abs(ds["sum_rule_residual"]) > allowed) & (ds["outcome"] == 0)
 
 
+_SPEEDS = ("critical_speed", "natural_frequency")
+
+
+def _speeds_differ(ds: xr.Dataset) -> xr.DataArray:
+    order = json.loads(ds.attrs.get("options", "{}")).get("order", 0)
+    return _differ(max(abs(order), 1) * ds["critical_speed"], 60 * ds["natural_frequency"])
+
+
 # The analyses of this package by name.
 BUILT_IN = {
     "atlas": Declared(
@@ -352,10 +361,18 @@ BUILT_IN = {
             ordered("natural_frequency", "mode"),
             within("natural_frequency", 0.0),
             multiple("angular_frequency", 2 * math.pi, "natural_frequency"),
-            multiple("critical_speed", 60.0, "natural_frequency"),
+            relation("critical_speed = 60/max(|order|, 1) natural_frequency", _SPEEDS, _speeds_differ),
             within("count_certified", 0.0, 1.0),
             within("mode_shape", -1.0, 1.0),
         ),
         figure="frequencies.critical_speeds",
+    ),
+    "whirl": Declared(
+        (
+            ordered("whirl_frequency", "mode"),
+            within("whirl_frequency", 0.0),
+            within("whirl_count_certified", 0.0, 1.0),
+        ),
+        figure="frequencies.whirl",
     ),
 }

@@ -483,6 +483,23 @@ def critical_speeds(system: System, *, outputs: Sequence[str] | None = None, **o
     return analyse("critical_speeds", system, outputs, options)
 
 
+def whirl(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
+    """Whirl frequencies [rad/s] of a stepped shaft that turns at ``speed``, forward and backward, rising.
+
+    Args as of :func:`floquet`; option ``modes`` (default 8). Outputs ``whirl_frequency`` (modes,), which is differentiable,
+    ``whirl_direction`` (0 backward, 1 planar, 2 forward) and ``whirl_count_certified``.
+
+    >>> import drivetrain_jax as dt
+    >>> rotor = dt.Bicardan(
+    ...     length=(0.4,), EI=(3e4,), rhoA=(0.0,), k_A=float("inf"), k_rot_A=float("inf"), k_D=0.0,
+    ...     m_D=12.0, I_D=0.09, Ip_D=0.17, speed=200.0,
+    ... )
+    >>> print(dt.whirl(rotor, modes=2).whirl_frequency.round(4))
+    [306.0077 344.1009]
+    """
+    return analyse("whirl", system, outputs, options)
+
+
 def phasing(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
     """Uneven rotation of the rigid output of a driveline, and the phases of the yokes that minimise it.
 

@@ -268,7 +268,9 @@ def orders_of(system: str, values: Mapping[str, Any]) -> Orders | None:
 
 
 def stored_orders(attrs: Mapping[str, Any]) -> Orders | None:
-    """The orders of a result with these attributes."""
+    """The orders of a result with these attributes; None if the result is that of one order."""
+    if json.loads(attrs.get("options", "{}")).get("order"):
+        return None
     known = json.loads(attrs.get("physical_data", "{}")) | json.loads(attrs.get("fixed_parameters", "{}"))
     return orders_of(str(attrs.get("system")), {n: e["value"] for n, e in known.items() if isinstance(e, dict)})
 

@@ -34,6 +34,7 @@ _BUILT_IN = {
     "steady_state": "steady_state:ANALYSIS",
     "basins": "basins:ANALYSIS",
     "critical_speeds": "critical_speeds.analysis:ANALYSIS",
+    "whirl": "critical_speeds.whirl:ANALYSIS",
 }
 
 __all__ = [

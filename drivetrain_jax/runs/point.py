@@ -379,7 +379,7 @@ def order_crossings(scene: Scene, parameters: Mapping[str, Any], values: Mapping
     """The crossings of the frequencies among the results ``values`` of one point; None without frequencies or orders."""
     name = next((name for name in FREQUENCIES if name in values), None)
     orders = orders_of(scene.system.name, {**parameters, **scene.data})
-    if name is None or orders is None:
+    if name is None or orders is None or scene.request.options.get("order"):
         return None
     frequency = in_hertz(values[name], scene.analysis.variable(name).units)
     return OrderCrossings(orders, orders.speeds(frequency), operating_range(scene.request.options))

@@ -201,7 +201,7 @@ _MODELS: dict[str, type] = {
     **dict.fromkeys(("steady_state", "basins", "frequency_response"), PiecewiseLinearOscillator),
     "modes": SpringSystem,
     "harmonic_response": DrivenSprings,
-    "critical_speeds": Shaft,
+    **dict.fromkeys(("critical_speeds", "whirl"), Shaft),
 }
 # What people give as a value, right or wrong.
 _DATA = (Complex, Decimal, str, bytes, list, tuple, dict, set, PathLike)

@@ -567,7 +567,7 @@ class UnderdampedOscillator(PiecewiseLinearOscillator):
     """An oscillator whose free motion oscillates in contact and within the play; kernels omit the overdamped flow."""
 
 
-# The lateral vibration of a stepped shaft: the model of the analysis ``critical_speeds``.
+# The lateral vibration of a stepped shaft: the model of the analyses ``critical_speeds`` and ``whirl``.
 
 
 class Shaft(NamedTuple):
@@ -585,6 +585,10 @@ class Shaft(NamedTuple):
     ``k_rot`` [N m/rad]: rotational springs to ground at the nodes, ``(n + 1, ...)``, 0 between the ends, up to infinity (a
     clamped end). ``inertia`` [kg m^2]: rotary inertia of discs at the nodes, ``(n + 1, ...)``; half of it sits on each side
     of an elastic joint.
+    ``polar`` [kg m^2]: polar inertia of the discs, ``(n + 1, ...)``; ``rhoIp`` [kg m]: that per length, ``(n, ...)``. They
+    act if the shaft turns: ``spin``, ``(2, ...)``, holds its speed [rad/s], negative for backward whirl, and 1 over the
+    order of critical speeds; see :meth:`turning`.
+    ``k_y`` [N/m]: springs to ground at the nodes in a second plane, ``(n + 1, ...)``.
     """
 
     length: Any
@@ -597,6 +601,10 @@ class Shaft(NamedTuple):
     rhoI: Any = None
     k_rot: Any = None
     inertia: Any = None
+    polar: Any = None
+    rhoIp: Any = None
+    spin: Any = None
+    k_y: Any = None
 
     @property
     def segments(self) -> int:
@@ -606,7 +614,7 @@ class Shaft(NamedTuple):
     @property
     def is_timoshenko(self) -> bool:
         """True if shear or rotary inertia is part of the model."""
-        return self.kGA is not None or self.rhoI is not None
+        return self.kGA is not None or self.rhoI is not None or self.rhoIp is not None
 
     @property
     def lanes(self) -> tuple[int, ...]:
@@ -615,7 +623,22 @@ class Shaft(NamedTuple):
 
     def mirrored(self) -> Shaft:
         """The same shaft seen from its other end."""
-        return Shaft(*(None if field is None else field[::-1] for field in self))
+        return Shaft(*(None if field is None else field[::-1] for field in self))._replace(spin=self.spin)
+
+    def turning(self, p: Array) -> Shaft:
+        """The shaft whose rotary inertias include the gyroscopic effect, ``I - (spin[0]/p + spin[1]) I_p``.
+
+        ``p`` has shape ``(..., *lanes)`` and so have these inertias, behind their first axis.
+        """
+        if self.spin is None:
+            return self
+        share = self.spin[0] / p + self.spin[1]
+        axes = (slice(None), *(None,) * (p.ndim + 1 - self.length.ndim))
+
+        def less(inertia: Any, polar: Any) -> Any:
+            return inertia if polar is None else (0.0 if inertia is None else inertia[axes]) - share * polar[axes]
+
+        return self._replace(inertia=less(self.inertia, self.polar), rhoI=less(self.rhoI, self.rhoIp))
 
     def spread(self) -> Shaft:
         """The same shaft with every field spread over all lanes."""

@@ -103,11 +103,19 @@ PHYSICAL = PhysicalData(
             "rhoA (outer_diameter^2 + inner_diameter^2)/16",
             optional=True,
         ),
+        Conversion(
+            "rhoIp",
+            (*_SECTION, "rhoA", "G"),
+            lambda outer, inner, rhoA, g: rhoA * (outer**2 + inner**2) / 8,
+            "rhoA (outer_diameter^2 + inner_diameter^2)/8",
+            optional=True,
+        ),
     ),
 )
 
 
-_PER_SEGMENT, _PER_JOINT = ("EI", "rhoA", "kGA", "rhoI"), ("k_joint", "m_joint", "k_hinge", "I_joint")
+_PER_SEGMENT = ("EI", "rhoA", "kGA", "rhoI", "rhoIp")
+_PER_JOINT = ("k_joint", "m_joint", "k_hinge", "I_joint", "Ip_joint", "k_joint_y")
 
 _SUPPORTS = {"k_A": 85e6, "k_D": 20e6}
 _REAL = {"length": (0.07, 0.59, 0.25), "rhoA": (15.288, 2.808, 5.5068), **_SUPPORTS}
@@ -132,11 +140,12 @@ def check(fixed: Mapping[str, Any]) -> None:
                     f"{name} = {list(value)}: {counted(len(value), 'entry', 'entries')} where length has {segments}; "
                     f"allowed is one per {what}, {needed}"
                 )
-    mass, rotary = (entries_of(fixed.get(name, ()), segments, none) for name, none in (("rhoA", 1.0), ("rhoI", 0.0)))
-    for i, (each, own) in enumerate(zip(mass, rotary, strict=True)):
-        # Traced values are not checked.
-        if isinstance(each, (int, float)) and isinstance(own, (int, float)) and each == 0 and own > 0:
-            raise ValueError(f"rhoI[{i}] = {own:g}: allowed is 0 for a segment without mass (rhoA[{i}] = 0)")
+    mass = entries_of(fixed.get("rhoA", ()), segments, 1.0)
+    for name in ("rhoI", "rhoIp"):
+        for i, (each, own) in enumerate(zip(mass, entries_of(fixed.get(name, ()), segments), strict=True)):
+            # Traced values are not checked.
+            if isinstance(each, (int, float)) and isinstance(own, (int, float)) and each == 0 and own > 0:
+                raise ValueError(f"{name}[{i}] = {own:g}: allowed is 0 for a segment without mass (rhoA[{i}] = 0)")
 
 
 # Stiffnesses [N m2] and masses per length [kg/m] beyond this range may overflow or underflow on the way to frequencies.
@@ -191,8 +200,29 @@ class Bicardan(System):
     I_joint: Numbers | Number = parameter(
         "kg m2", "rotary inertias at the joints, half on each side of an elastic joint", **_NONE
     )
+    speed: Number = parameter("rad/s", "speed of the shaft", default=0.0, lower=0.0)
+    Ip_A: Number = parameter("kg m2", "polar inertia of a disc or yoke at A", default=0.0, lower=0.0)
+    Ip_D: Number = parameter("kg m2", "polar inertia of a disc or yoke at D", default=0.0, lower=0.0)
+    Ip_joint: Numbers | Number = parameter(
+        "kg m2", "polar inertias at the joints, half on each side of an elastic joint", **_NONE
+    )
+    rhoIp: Numbers | Number = parameter("kg m", "polar inertia per length of the segments", symbol="ρI_p", **_NONE)
+    k_A_y: Number | None = parameter(
+        "N/m", "stiffness of the support at A in a second plane", derived="k_A", lower=0.0, infinite=True
+    )
+    k_D_y: Number | None = parameter(
+        "N/m", "stiffness of the support at D in a second plane", derived="k_D", lower=0.0, infinite=True
+    )
+    k_joint_y: Numbers | Number | None = parameter(
+        "N/m",
+        "stiffness of supports at the joints in a second plane",
+        derived="k_joint",
+        broadcast=True,
+        infinite=True,
+        **_LIST,
+    )
 
-    @serves("critical_speeds", check=check)
+    @serves("critical_speeds", "whirl", check=check)
     def shaft(self) -> Shaft:
         """The shaft with these parameters (numbers, or arrays of one shape of lanes; lists as tuples of them).
 
@@ -211,6 +241,12 @@ class Bicardan(System):
         masses = (self.m_A, *entries("m_joint", segments - 1, 0.0), self.m_D)
         springs = (self.k_rot_A, *(0.0,) * (segments - 1), self.k_rot_D)
         inertias = (self.I_A, *entries("I_joint", segments - 1, 0.0), self.I_D)
+        polar = unless((self.Ip_A, *entries("Ip_joint", segments - 1, 0.0), self.Ip_D), 0.0)
+        per_length, second = unless(entries("rhoIp", segments, 0.0), 0.0), None
+        if any(k is not None for k in (self.k_A_y, self.k_D_y, self.k_joint_y)):
+            first, last = (k if k_y is None else k_y for k, k_y in ((self.k_A, self.k_A_y), (self.k_D, self.k_D_y)))
+            joints = entries("k_joint" if self.k_joint_y is None else "k_joint_y", segments - 1, 0.0)
+            second = stack((first, *joints, last))
         return Shaft(
             stack(length),
             stack(entries("EI", segments, 0.0)),
@@ -222,4 +258,8 @@ class Bicardan(System):
             unless(entries("rhoI", segments, 0.0), 0.0),
             unless(springs, 0.0),
             unless(inertias, 0.0),
+            polar,
+            per_length,
+            None if polar is None and per_length is None else stack((self.speed, 0.0)),
+            second,
         ).arrays()

@@ -33,6 +33,7 @@ from drivetrain_jax.view.style import (
     suitable,
     unit_of,
     units_of,
+    value_in,
     variable_label,
 )
 
@@ -56,6 +57,10 @@ _NUMBER: dict[str, Any] = {"va": "top", "path_effects": [withStroke(linewidth=2,
 _SPEEDS = ("critical_speed", *FREQUENCIES)
 # Line styles of the orders, and their colours in maps.
 _DASHES, _ORDER_COLOURS = ("solid", "dashed", "dotted", "dashdot"), ("black", LINE_COLOURS[1])
+# Colours of backward, planar and forward whirl.
+_SENSES = ("#16324f", "#9a9a9a", "#d1771e")
+# Height of a Campbell diagram relative to the highest frequency.
+_TOP = 1.05
 _OPERATING: dict[str, Any] = {"color": LINE_COLOURS[1], "alpha": 0.2, "zorder": 0, "label": "operating speeds"}
 # Height of the shaft's segment of greatest stiffness, in units of the largest deflection; symbols of its points.
 _THICKNESS = 0.3
@@ -420,6 +425,62 @@ def _draw_shaft(
         style: dict[str, Any] = {"clip_on": False, "linestyle": "none", "color": FRAME_GREY, "label": name}
         # An empty line that is not clipped would disturb the layout.
         sheet.add(*(axes.plot(places, [level] * len(places), **style, **_SYMBOLS[name]) if places else ()))
+
+
+def whirl(dataset: xr.Dataset) -> Figure | None:
+    """Campbell diagram: whirl frequencies over the speed of the shaft, coloured by direction, crossed by the lines of its
+    orders; None for other axes.
+
+    Curves follow the modes of each direction where these may cross (isotropic supports), otherwise the number of the mode.
+    Crossings have their speeds as numbers; on isotropic supports order 1, the unbalance, excites forward whirl alone.
+    """
+    if charts.sweep_axes(dataset) != ["speed"]:
+        return None
+    charts.require(dataset, "whirl_frequency", "whirl_direction")
+    charts.require_values(dataset["whirl_frequency"], positive=True)
+    dataset = dataset.sortby("speed").transpose("speed", ...)
+    x, y, codes = (dataset[name].values for name in ("speed", "whirl_frequency", "whirl_direction"))
+    y = np.where(np.isfinite(y), y, np.nan)
+    isotropic = not any(f"k_{place}_y" in parameters(dataset) for place in ("A", "D", "joint"))
+    if isotropic:
+        y = np.hstack([np.sort(np.where(codes == code, y, np.nan), axis=1) for code in (0, 2)])
+        codes = np.broadcast_to(np.repeat((0, 2), y.shape[1] // 2), y.shape)
+    kept = np.isfinite(y).sum(axis=0) > 1
+    modes = np.cumsum(kept.reshape(1 + isotropic, -1), axis=1).ravel()[kept]
+    y, colours = y[:, kept], np.array(_SENSES)[codes[:, kept]]
+    sheet = Sheet(height=4.4)
+    axes = sheet.axes[0, 0]
+    for curve, look in zip(y.T, colours.swapaxes(0, 1), strict=True):
+        points = np.stack([x, curve], axis=-1)
+        pieces = [*np.stack([points[:-1], points[1:]], axis=1)]
+        # A piece between two points has the colour of its end.
+        axes.add_collection(LineCollection(pieces, colors=look[1:].tolist(), linewidths=1.1))
+    axes.set(xlim=(x[0], x[-1]), ylim=(0, _TOP * np.nanmax(y)))
+    last = len(x) - 1 - np.isfinite(y[::-1]).argmax(axis=0), np.arange(y.shape[1])
+    ends, names = np.stack([x[last[0]], y[last]], axis=-1), [str(mode) for mode in modes]
+    sheet.later(partial(write_names, axes, ends, names, colours=colours[last].tolist()))
+    for colour, name in zip(_SENSES, charts.flags(dataset["whirl_direction"]), strict=True):
+        sheet.add(*([Line2D([], [], color=colour, label=name)] if colour in colours[1:] else []))
+    orders, units = stored_orders(dataset.attrs), str(dataset["whirl_frequency"].attrs["units"])
+    turned = value_in(dataset["speed"], "rad/s") * suitable("rad/s", [units])[0]
+    for (label, times), dashes in zip(orders.per_turn.items() if orders else (), _DASHES, strict=False):
+        sheet.add(*axes.plot(x, times * turned, color="black", linewidth=0.9, linestyle=dashes, label=label))
+        excited = y[:, colours[0] == _SENSES[2]] if isotropic and times == 1 else y
+        met = [point for curve in excited.T for point in _crossings(x, curve, times * turned)]
+        axes.plot(*np.reshape(met, (-1, 2)).T, "o", markersize=3.5, color="black", markerfacecolor="white")
+        numbers = [f"{float(f'{speed:.4g}'):.10g}" for speed, _ in met]
+        sheet.later(partial(write_names, axes, met, numbers, offset=4.0, **_NUMBER))
+    frequency = variable_label(dataset["whirl_frequency"])
+    sheet.label(axis_label(dataset["speed"]), f"{frequency} (number of the mode at the right)")
+    return sheet.finish(dataset)
+
+
+def _crossings(x: np.ndarray, curve: np.ndarray, line: np.ndarray) -> list[tuple[float, float]]:
+    """Points at which ``curve`` crosses ``line``, by interpolation."""
+    gap = curve - line
+    places = np.flatnonzero((gap[:-1] >= 0) != (gap[1:] >= 0))
+    shares = [(k, gap[k] / (gap[k] - gap[k + 1])) for k in places if np.isfinite(gap[k : k + 2]).all()]
+    return [(x[k] + s * (x[k + 1] - x[k]), curve[k] + s * (curve[k + 1] - curve[k])) for k, s in shares]
 
 
 def _interference(dataset: xr.Dataset, orders: Orders, colours: Any, kinds: Mapping[str, str]) -> Figure:

@@ -84,8 +84,8 @@ def symbol(name: str) -> str:
 
     Entries of a list are numbered from 0, as in scenes: ``m_p[1]`` is m_p,1.
     """
-    if match := re.fullmatch(r"(.+)\[(\d+)\]", name):
-        head, number = symbol(match[1]), match[2]
+    if match := re.fullmatch(r"(.+)\[(\d+)\]|(k_.+)_(y)", name):
+        head, number = symbol(match[1] or match[3]), match[2] or match[4]
         if not head.endswith("$"):
             return f"{head}[{number}]"
         return f"{head[:-2]},{number}}}$" if head.endswith("}$") else f"{head[:-1]}_{{{number}}}$"
@@ -98,7 +98,7 @@ def symbol(name: str) -> str:
         head, index = match[1], match[2] or match[3]
         head = rf"\{head}" if head in _GREEK else head
         return rf"${head}_{{{index}}}$" if index else f"${head}$"
-    if match := re.fullmatch(r"([A-Za-z])_([a-z]{3,})", name):
+    if match := re.fullmatch(r"(Ip|[A-Za-z])_([a-z]{3,})", name):
         return rf"${match[1]}_{{\mathrm{{{match[2]}}}}}$"
     return name.replace("_", " ")
 

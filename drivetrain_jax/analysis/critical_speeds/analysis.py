@@ -1,9 +1,10 @@
 """Critical speeds: natural frequencies of the lateral vibration of a shaft, certified by a count.
 
 The synchronous critical speed of a shaft whose gyroscopic effect is neglected is its natural frequency, ``n = 30 p/pi``
-rpm. The method ``certified`` (default, :mod:`~drivetrain_jax.analysis.critical_speeds.frequency_roots`) has full accuracy
-for any mode. The method ``krylov_determinant`` is the paper's and loses all digits near mode 12; ``count_certified`` marks
-its roots with the right number.
+rpm. With an ``order`` the inertias include the gyroscopic effect at the speed ``p/|order|``. The method ``certified``
+(default, :mod:`~drivetrain_jax.analysis.critical_speeds.frequency_roots`) has full accuracy for any mode. The method
+``krylov_determinant`` is the paper's and loses all digits near mode 12; ``count_certified`` marks its roots with the right
+number.
 
 Modes are numbered by frequency and not followed along an axis. The frequencies of a shaft in one plane between separated
 ends are simple (except with a hinge on, or almost on, a rigid support, or by coincidence), so curves of equal number do not
@@ -89,6 +90,15 @@ VARIABLES = (
 OPTIONS = (
     Parameter("modes", "1", "number of modes, zero modes included", default=6, lower=1, upper=1000, integer=True),
     Parameter("stations", "1", "number of points of a mode shape", default=101, lower=2, upper=10001, integer=True),
+    Parameter(
+        "order",
+        "1",
+        "order of the excitation, < 0: backward (0: at rest, in the first plane)",
+        default=0,
+        lower=-100,
+        upper=100,
+        integer=True,
+    ),
     Parameter("operating_min", "rpm", "lowest operating speed", default=0.0, lower=0.0),
     Parameter("operating_max", "rpm", "highest operating speed (0: not given)", default=0.0, lower=0.0),
     Parameter(
@@ -117,6 +127,13 @@ Build = Callable[[Mapping[str, Any]], Shaft]
 
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     options = request.options
+    lacking = [name for name in ("relative_error", "mode_shape") if name in request.outputs]
+    if (
+        lacking
+        and options.get("order", 0)
+        and any(fixed.get(f"k_{place}_y") is not None for place in ("A", "D", "joint"))
+    ):
+        raise InputError(f"outputs: {lacking[0]!r} is not computed for two planes; allowed is order = 0")
     if request.method == "krylov_determinant":
         for name in (name for name in _ADDITIONS if name in {p.name for p in system.parameters}):
             if fixed.get(name) != system.parameter(name).default:
@@ -156,20 +173,41 @@ def _shapes(shaft: Shaft, roots: Roots, stations: int) -> Array:
     return jnp.where(jnp.isnan(roots.q)[:, None], jnp.nan, shape)
 
 
+def _at_order(shaft: Shaft, order: int) -> Shaft:
+    """The shaft whose natural frequencies are those of the critical speeds of ``order``; 0: at rest."""
+    if order == 0:
+        return shaft._replace(polar=None, rhoIp=None, spin=None, k_y=None)
+    if shaft.spin is not None:
+        shaft = shaft._replace(spin=jnp.stack([0.0 * shaft.spin[0], 0.0 * shaft.spin[1] + 1 / order]))
+    if shaft.k_y is not None:
+        return shaft
+    return shaft.turning(jnp.ones(shaft.lanes))._replace(polar=None, rhoIp=None)
+
+
+def _units(options: Mapping[str, Any]) -> dict[str, float]:
+    """Units of the frequencies; a shaft of the critical speed turns once in ``order`` vibrations."""
+    return _UNITS | {"critical_speed": _UNITS["critical_speed"] / max(abs(options.get("order", 0)), 1)}
+
+
+def outcomes(shaft: Shaft, roots: Roots) -> Array:
+    """Outcome of every lane."""
+    finite = jnp.all(jnp.isfinite(shaft.length) & jnp.isfinite(shaft.EI) & jnp.isfinite(shaft.rhoA), axis=0)
+    missing, doubtful = jnp.any(jnp.isnan(roots.q), axis=0), ~jnp.all(roots.certified, axis=0)
+    outcome = jnp.where(missing, Outcome.NOT_CONVERGED, jnp.where(doubtful, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS))
+    return jnp.where(finite & ~is_undefined(shaft), outcome, Outcome.NOT_FINITE).astype(jnp.int8)
+
+
 def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """All requested results; for arrays of lanes the lanes are the last axis."""
-    shaft, options = build(values), request.options
+    options = request.options
+    shaft = _at_order(build(values), options.get("order", 0))
     certified = request.method == "certified"
     roots = (shaft_roots.find_roots if certified else shaft_roots.krylov_roots)(shaft, options["modes"])
     p = roots.q**2
-    finite = jnp.all(jnp.isfinite(shaft.length) & jnp.isfinite(shaft.EI) & jnp.isfinite(shaft.rhoA), axis=0)
-    finite = finite & ~is_undefined(shaft)
-    missing, doubtful = jnp.any(jnp.isnan(roots.q), axis=0), ~jnp.all(roots.certified, axis=0)
-    outcome = jnp.where(missing, Outcome.NOT_CONVERGED, jnp.where(doubtful, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS))
     results = {
-        **{name: p * unit for name, unit in _UNITS.items()},
+        **{name: p * unit for name, unit in _units(options).items()},
         "count_certified": roots.certified.astype(jnp.int8),
-        "outcome": jnp.where(finite, outcome, Outcome.NOT_FINITE).astype(jnp.int8),
+        "outcome": outcomes(shaft, roots),
     }
     if "relative_error" in request.outputs:
         results["relative_error"] = shaft_roots.relative_error(shaft, roots)
@@ -199,19 +237,20 @@ def _derivatives(
     system: type[System], request: Request, parameters: Any, constants: Constants, results: Mapping[str, Array]
 ) -> dict[str, Array]:
     """Jacobians of all frequencies and of the separation margin."""
-    options = request.options
+    options, units = request.options, _units(request.options)
 
     def build(parameters: Any) -> Shaft:
-        return system.models["critical_speeds"].build(eqx.combine(parameters, constants.tree))
+        shaft = system.models["critical_speeds"].build(eqx.combine(parameters, constants.tree))
+        return _at_order(shaft, options.get("order", 0))
 
-    known = [results[name] / unit for name, unit in _UNITS.items() if name in results and request.method == "certified"]
+    known = [results[name] / unit for name, unit in units.items() if name in results and request.method == "certified"]
     q = jnp.sqrt(known[0]) if known else shaft_roots.find_roots(build(parameters), options["modes"]).q
     slope = frequency_derivatives(build, parameters, q)
-    found = {name: slope * unit for name, unit in _UNITS.items()}
+    found = {name: slope * unit for name, unit in units.items()}
     if "separation_margin" in results:
         low, high = options["operating_min"], options["operating_max"]
         margin = jax.vmap(jax.grad(lambda speed: separation_margin(speed, low, high)))
-        found["separation_margin"] = margin(q**2 * _UNITS["critical_speed"])[:, None] * found["critical_speed"]
+        found["separation_margin"] = margin(q**2 * units["critical_speed"])[:, None] * found["critical_speed"]
     return found
 
 
@@ -220,7 +259,10 @@ ANALYSIS = Analysis(
     title="critical speeds",
     variables=VARIABLES,
     default_outputs=("natural_frequency", "critical_speed", "count_certified"),
-    methods={"certified": _OPTION_NAMES, "krylov_determinant": _OPTION_NAMES},
+    methods={
+        "certified": _OPTION_NAMES,
+        "krylov_determinant": tuple(name for name in _OPTION_NAMES if name != "order"),
+    },
     method_titles={
         "certified": "roots counted, at full accuracy for any mode",
         "krylov_determinant": "the plain determinant, as published: it loses roots near mode 12",

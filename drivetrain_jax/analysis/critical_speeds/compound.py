@@ -113,10 +113,11 @@ class LastNode(NamedTuple):
     e3: Array
 
 
-def segments_of(shaft: Shaft, faint: bool = False) -> tuple[Segment, LastNode]:
-    """The segments, each with the node in front of it, and the last node; for ``faint`` see :class:`Scales`."""
+def segments_of(shaft: Shaft, q: Array, faint: bool = False) -> tuple[Segment, LastNode]:
+    """The segments, each with the node in front of it, and the last node, at ``q``; for ``faint`` see :class:`Scales`."""
     scales = Scales.of(shaft)
     inner = Scales.of(shaft, faint=True) if faint else scales
+    shaft = shaft.turning(q * q)
     unit = jnp.concatenate([scales.e3[:1], between(scales.e3), scales.e3[-1:]])
     hinges = turn = None
     if shaft.k_hinge is not None:
@@ -129,7 +130,10 @@ def segments_of(shaft: Shaft, faint: bool = False) -> tuple[Segment, LastNode]:
         shear = jnp.zeros_like(square) if shaft.kGA is None else square * shaft.EI / shaft.kGA
         # A segment without mass has no rotary inertia either.
         mass = jnp.where(shaft.rhoA == 0, 1.0, shaft.rhoA)
-        rotary = jnp.zeros_like(square) if shaft.rhoI is None else square * shaft.rhoI / mass
+        rotary = jnp.zeros_like(square)
+        if shaft.rhoI is not None:
+            axes = (slice(None), *(None,) * (shaft.rhoI.ndim - square.ndim))
+            rotary = square[axes] * shaft.rhoI / mass[axes]
     before, behind = split_inertia(shaft)
     k_rot, inertia, m = (None if x is None else x[:-1] for x in (shaft.k_rot, behind, shaft.m))
     own = inner.beta, inner.e1, inner.e2, inner.e3, None if faint else inner.r
@@ -256,7 +260,8 @@ def compound(z: Array, r: Array | float) -> Compound:
 
 class Waves(NamedTuple):
     """Squared wave numbers of a Timoshenko segment over alpha^2: solutions are ``exp(+-hyperbolic z)`` and
-    ``exp(+-i trigonometric z)``; ``hyperbolic2`` is negative above the cut-off frequency (``s t > 1``)."""
+    ``exp(+-i trigonometric z)``; ``hyperbolic2`` is negative above the cut-off frequency (``s t > 1``). The
+    gyroscopic effect may make ``t`` negative."""
 
     trigonometric2: Any
     hyperbolic2: Any
@@ -265,8 +270,10 @@ class Waves(NamedTuple):
     def of(cls, s: Any, t: Any) -> Waves:
         """From the shear number and the rotary number."""
         half = (s + t) / 2
-        trigonometric2 = half + jnp.sqrt(((s - t) / 2) ** 2 + 1)
-        return cls(trigonometric2, (1 - s * t) / trigonometric2)
+        # The larger one without cancellation, the other by their product.
+        larger = jnp.where(half < 0, -half, half) + jnp.sqrt(((s - t) / 2) ** 2 + 1)
+        pair = larger, (1 - s * t) / larger
+        return cls(jnp.where(half < 0, pair[1], pair[0]), jnp.where(half < 0, pair[0], pair[1]))
 
 
 class General(NamedTuple):
@@ -326,7 +333,7 @@ def general(z: Array, r: Array | float, s: Array, t: Array) -> General:
         g3,
         g4,
     )
-    small = massless | (z * z * 2 * (jnp.maximum(s, t) + 1) < _SERIES**2)
+    small = massless | (z * z * 2 * (jnp.maximum(s, jnp.abs(t)) + 1) < _SERIES**2)
     summed = _general_series(jnp.where(small, z, 0.0), r, s, t)
     g = tuple(jnp.where(small, unit * a, b) for a, b in zip(summed, direct, strict=True))
     return General(r, s, t, unit, growth, g)  # pyright: ignore[reportArgumentType]
@@ -370,7 +377,7 @@ def characteristic(shaft: Shaft, q: Array) -> Value:
     ``q`` has shape ``(..., *lanes)`` and the fields of ``shaft`` ``(n, *lanes)``; results have the shape of ``q``.
     """
     # Faint instead of no mass: the same digits without multiplications by r.
-    segments, last = segments_of(shaft, faint=True)
+    segments, last = segments_of(shaft, q, faint=True)
     zero = q * 0 * segments.beta[0]
     start = _State((zero + 1, zero, zero, zero, zero), zero + 1, zero)
 
@@ -410,7 +417,7 @@ def planes(shaft: Shaft, q: Array) -> tuple[Plane, Plane, Array, Array]:
     passed where the plane from the right has not. It is common because the units of supports and joints are those of
     both sides: the mirrored shaft has the same.
     """
-    segments, _ = segments_of(shaft)
+    segments, _ = segments_of(shaft, q)
     zero = q * 0 * segments.beta[0]
     start = _State((zero + 1, zero, zero, zero, zero), zero + 1, zero)
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -22,7 +23,8 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis._base import stacked
-from drivetrain_jax.analysis.critical_speeds.compound import Scales, characteristic, pairings
+from drivetrain_jax.analysis.critical_speeds import coupled
+from drivetrain_jax.analysis.critical_speeds.compound import Scales, Value, characteristic, pairings
 from drivetrain_jax.analysis.critical_speeds.mechanisms import (
     highest_frequency,
     is_undefined,
@@ -43,6 +45,8 @@ _CLOSED = 4 * np.finfo(float).eps
 # Ratio of the ends up to which a bracket is narrow enough for arithmetic means and for interpolation.
 _NEAR = 4.0
 _TRUNCATION = 0.2
+# An upper end rises by factors of _NEAR, nine times at most, while the count does not confirm it.
+_HIGHEST = 1.5 / _NEAR**10
 # Share of the brackets that continue together, and the smallest useful number.
 _FEW, _WORTH = 1 / 16, 32
 # Relative distance up to which frequencies count as one; and up to which a zero of Psi is that of the frequency.
@@ -61,7 +65,8 @@ class Roots(NamedTuple):
 
 
 class _Brackets(NamedTuple):
-    """Ends of the brackets in q, the count and Psi there, the factor of the next lower trial while ``low`` is 0,
+    """Ends of the brackets in q, the count and Psi there (a count of -1 above must yet be confirmed), the factor of the next
+    lower trial while ``low`` is 0,
     whether one simple root is left, the width when that was first so, and the reach of interpolation that is left."""
 
     low: Array
@@ -86,7 +91,13 @@ def _start(shaft: Shaft, modes: int) -> _Brackets:
     high = jnp.where(total == 0, highest_frequency(shaft), high)
     high = jnp.where(is_undefined(shaft), jnp.nan, jnp.broadcast_to(high, (modes, *lanes)))
     zero = jnp.zeros_like(high)
-    return _Brackets(zero, high, zero - 1, zero + jnp.inf, zero, zero, zero + 1 / _NEAR, zero > 0, zero, zero)
+    # The gyroscopic effect may lift frequencies above those at rest: the count must confirm their upper ends.
+    above = zero + (jnp.inf if shaft.spin is None and shaft.k_y is None else -1.0)
+    return _Brackets(zero, high, zero - 1, above, zero, zero, zero + 1 / _NEAR, zero > 0, zero, zero)
+
+
+def _unconfirmed(b: _Brackets) -> Array:
+    return b.count_high < 0
 
 
 def _trial(b: _Brackets) -> Array:
@@ -103,20 +114,22 @@ def _trial(b: _Brackets) -> Array:
     reach = jnp.where(b.isolated, jnp.maximum(b.span - 0.5 * width, 0.0), 0.0)
     truncated = jnp.clip(truncated, middle - reach, middle + reach)
     near = b.high <= _NEAR * b.low
-    return jnp.where(b.low == 0, b.high * b.shrink, jnp.where(near, truncated, jnp.sqrt(b.low * b.high)))
+    trial = jnp.where(b.low == 0, b.high * b.shrink, jnp.where(near, truncated, jnp.sqrt(b.low * b.high)))
+    return jnp.where(_unconfirmed(b), b.high, trial)
 
 
 def _closed(b: _Brackets) -> Array:
-    return ~(b.high - b.low > _CLOSED * b.high)
+    return ~(b.high - b.low > _CLOSED * b.high) | (_unconfirmed(b) & (b.shrink < _HIGHEST))
 
 
 def _step(shaft: Shaft, index: Array, b: _Brackets) -> _Brackets:
     q = _trial(b)
     # Computed once for all uses: near a root two kernels may round to different counts, and the ends would contradict.
-    value = stored(characteristic)(shaft, q)
-    above = value.count >= index
-    shrink = jnp.where((b.low == 0) & above, b.shrink * b.shrink, b.shrink)
-    low, high = jnp.where(above, b.low, q), jnp.where(above, q, b.high)
+    value = stored(_characteristic(shaft))(shaft, q)
+    above, unconfirmed = value.count >= index, _unconfirmed(b)
+    shrink = jnp.where((b.low == 0) & above & ~unconfirmed, b.shrink * b.shrink, b.shrink)
+    shrink = jnp.where(unconfirmed & ~above, b.shrink / _NEAR, shrink)
+    low, high = jnp.where(above, b.low, q), jnp.where(above, q, jnp.where(unconfirmed, _NEAR * b.high, b.high))
     count_low, count_high = jnp.where(above, b.count_low, value.count), jnp.where(above, value.count, b.count_high)
     psi_low, psi_high = jnp.where(above, b.psi_low, value.psi), jnp.where(above, value.psi, b.psi_high)
     isolated = (count_high - count_low == 1) & (high <= _NEAR * low) & (psi_low * psi_high < 0)
@@ -125,6 +138,10 @@ def _step(shaft: Shaft, index: Array, b: _Brackets) -> _Brackets:
     new = _Brackets(low, high, count_low, count_high, psi_low, psi_high, shrink, isolated, first_width, span)
     done = _closed(b)
     return jax.tree.map(lambda old, fresh: jnp.where(done, old, fresh), b, new)
+
+
+def _characteristic(shaft: Shaft) -> Callable[[Shaft, Array], Value]:
+    return characteristic if shaft.k_y is None else coupled.characteristic
 
 
 def _search(shaft: Shaft, modes: int) -> _Brackets:
@@ -177,6 +194,7 @@ def find_roots(shaft: Shaft, modes: int) -> Roots:
     index = jnp.arange(1, modes + 1).reshape(modes, *(1,) * (brackets.high.ndim - 1))
     finite = jnp.isfinite(brackets.high)
     zero, absent = (index <= zero_modes(shaft)) & finite, (index > number_of_modes(shaft)) & finite
+    absent = absent | (~zero & finite & _unconfirmed(brackets) & _closed(brackets))
     certified = (_closed(brackets) & (brackets.low > 0) & (brackets.count_low >= 0) & finite) | zero | absent
     q = jnp.where(zero, 0.0, 0.5 * (brackets.low + brackets.high))
     width = jnp.where(zero, 0.0, 2 * (brackets.high - brackets.low) / brackets.high)
@@ -195,8 +213,9 @@ def frequency_derivatives(build: Callable[[Any], Shaft], parameters: Any, q: Arr
     """
     shaft, moving = build(parameters), (q > 0) & jnp.isfinite(q)
     safe = jnp.where(moving, q, 1.0)
-    psi, along_q = jax.jvp(lambda x: pairings(shaft, x), (safe,), (jnp.ones_like(safe),))
-    along = stacked(jax.jacfwd(lambda p: pairings(build(p), safe))(parameters))
+    function = pairings if shaft.k_y is None else partial(coupled.residual, coupled.null_vectors(shaft, safe))
+    psi, along_q = jax.jvp(lambda x: function(shaft, x), (safe,), (jnp.ones_like(safe),))
+    along = stacked(jax.jacfwd(lambda p: function(build(p), safe))(parameters))
     # A section that the mode does not reach does not show its frequency as a zero.
     section = jnp.argmin(jnp.abs(psi / along_q), axis=0)[None]
     along_q, along = (
@@ -208,7 +227,7 @@ def frequency_derivatives(build: Callable[[Any], Shaft], parameters: Any, q: Arr
     def missing(parameters: Any) -> Array:
         """Stiffness of all springs and hinges that are not there."""
         springs = build(parameters)
-        present = [x for x in (springs.k, springs.k_hinge, springs.k_rot) if x is not None]
+        present = [x for x in (springs.k, springs.k_y, springs.k_hinge, springs.k_rot) if x is not None]
         return jnp.concatenate([jnp.where(x == 0, x, 0.0) for x in present])
 
     held = jnp.any(stacked(jax.jacfwd(missing)(parameters)) != 0, axis=0)
@@ -220,7 +239,7 @@ def _multiple(shaft: Shaft, q: Array) -> Array:
     near = q[1:] - q[:-1] <= _MULTIPLE * q[1:]
     none = jnp.zeros_like(q[:1], bool)
     above = jnp.where((q[-1:] > 0) & jnp.isfinite(q[-1:]), q[-1:] * (1 + _MULTIPLE), 1.0)
-    beyond = (q[-1:] > 0) & (characteristic(shaft, above).count > len(q))
+    beyond = (q[-1:] > 0) & (_characteristic(shaft)(shaft, above).count > len(q))
     return jnp.concatenate([none, near]) | jnp.concatenate([near, beyond])
 
 

@@ -13,11 +13,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax.analysis.numerics.linear_algebra import matmul
+from drivetrain_jax.analysis.numerics.linear_algebra import inertia_and_determinant, matmul
 from drivetrain_jax.systems import Shaft
 
 # Size up to which a combination of motions counts as none: they are of order one.
 _NOTHING = 1e-9
+# Frequency at which the gyroscopic effect exceeds every inertia [rad/s].
+_SLOW = 1e-60
 
 
 class _Held(NamedTuple):
@@ -28,11 +30,43 @@ class _Held(NamedTuple):
     behind: Array
 
 
+def _in_planes(shaft: Shaft) -> tuple[Shaft, ...]:
+    """The shaft in each plane of its supports."""
+    return (shaft,) if shaft.k_y is None else (shaft._replace(k_y=None), shaft._replace(k=shaft.k_y, k_y=None))
+
+
+def _slow_inertias(shaft: Shaft) -> Shaft:
+    """The shaft with the signs of its rotary inertias at the lowest frequencies, where the gyroscopic effect prevails."""
+    return shaft.turning(jnp.full(shaft.lanes, _SLOW))
+
+
 def zero_modes(shaft: Shaft) -> Array:
-    """Number of mechanisms (modes of frequency 0), shape of the lanes, from the missing springs and hinges."""
+    """Number of mechanisms (modes of frequency 0), shape of the lanes, from the missing springs and hinges.
+
+    The gyroscopic effect gives a mechanism a frequency if it makes its inertia negative.
+    """
+    if shaft.spin is not None or shaft.k_y is not None:
+        return _slow_modes(shaft)
     held = shaft.k > 0
     turning = jnp.zeros_like(held) if shaft.k_rot is None else shaft.k_rot > 0
     return _free_motions(shaft, _Held(held, turning, turning))
+
+
+def _slow_modes(shaft: Shaft) -> Array:
+    """Number of positive inertias of the mechanisms, of both planes together if there are two."""
+    lanes, shaft = shaft.lanes, shaft.spread()
+    ends, at_ends = _at_ends(shaft)
+    free, *second = (_unrestrained(plane, at_ends) for plane in _in_planes(shaft))
+    turned = shaft if shaft.spin is None else shaft._replace(spin=-shaft.spin)
+    mass, backward = (_masses(_slow_inertias(each), at_ends, ends) for each in (shaft, turned))
+    if second:
+        none = jnp.zeros_like(free)
+        free = jnp.concatenate([jnp.concatenate([free, none], 1), jnp.concatenate([none, second[0]], 1)])
+        own, other = mass + backward, mass - backward
+        mass = jnp.concatenate([jnp.concatenate([own, other], 1), jnp.concatenate([other, own], 1)])
+    matrix = matmul(jnp.swapaxes(free, 0, 1), matmul(mass, free))
+    flat = -matrix.reshape(*matrix.shape[:2], -1)
+    return jax.vmap(lambda each: inertia_and_determinant(each)[0], in_axes=-1)(flat).reshape(lanes).astype(int)
 
 
 def is_undefined(shaft: Shaft) -> Array:
@@ -40,6 +74,9 @@ def is_undefined(shaft: Shaft) -> Array:
 
     Such a mechanism remains where everything that has mass is held. Shape of the lanes.
     """
+    if shaft.k_y is not None:
+        first, second = (is_undefined(plane) for plane in _in_planes(shaft))
+        return first | second
     massive = shaft.rhoA > 0
     none = jnp.zeros_like(massive[:1])
     deflection = jnp.concatenate([massive, none]) | jnp.concatenate([none, massive]) | (shaft.k > 0)
@@ -47,7 +84,7 @@ def is_undefined(shaft: Shaft) -> Array:
     if shaft.m is not None:
         deflection = deflection | (shaft.m > 0)
     if shaft.inertia is not None:
-        turning = turning | (shaft.inertia > 0)
+        turning = turning | (shaft.inertia != 0)
     weightless = _free_motions(shaft, _Held(deflection, turning, turning)) > 0
     return weightless if shaft.rhoI is None else weightless | jnp.any(~massive & (shaft.rhoI > 0), axis=0)
 
@@ -90,18 +127,26 @@ def _free_motions(shaft: Shaft, held: _Held) -> Array:
 
 def number_of_modes(shaft: Shaft) -> Array:
     """Number of natural frequencies, zero modes included, shape of the lanes: infinite if a segment has mass."""
+    if shaft.k_y is not None:
+        forward, backward = _in_planes(shaft)
+        return number_of_modes(forward) + number_of_modes(
+            backward._replace(spin=None if shaft.spin is None else -shaft.spin)
+        )
     moving = _moving(shaft)
     count = jnp.sum(moving.deflection, axis=0) + jnp.sum(moving.before, axis=0) + jnp.sum(moving.behind, axis=0)
     return jnp.where(jnp.any(shaft.rhoA > 0, axis=0), jnp.inf, count)
 
 
 def _moving(shaft: Shaft) -> _Held:
-    """Flags of the motions of the nodes that have a mass of their own; the whole inertia of a rigid joint is behind it."""
-    none = jnp.zeros(shaft.k.shape, bool)
+    """Flags of the motions of the nodes that have a mass of their own; the whole inertia of a rigid joint is behind it.
+
+    A polar inertia alone gives a tilt a frequency of backward whirl.
+    """
+    none, inertia = jnp.zeros(shaft.k.shape, bool), _slow_inertias(shaft).inertia
     deflection = none if shaft.m is None else (shaft.m > 0) & jnp.isfinite(shaft.k)
-    if shaft.inertia is None:
+    if inertia is None:
         return _Held(deflection, none, none)
-    behind = shaft.inertia > 0
+    behind = inertia > 0 if shaft.inertia is None else (inertia > 0) | (shaft.inertia > 0)
     if shaft.k_rot is not None:
         behind = behind & jnp.isfinite(shaft.k_rot)
     if shaft.k_hinge is None:
@@ -114,7 +159,8 @@ def _moving(shaft: Shaft) -> _Held:
 def highest_frequency(shaft: Shaft) -> Array:
     """A bound of ``q = sqrt(p)`` of all frequencies of a shaft whose segments have no mass, shape of the lanes.
 
-    No eigenvalue p^2 exceeds the sum of stiffness over mass of the motions of single nodes with mass.
+    No eigenvalue p^2 exceeds the sum of stiffness over mass of the motions of single nodes with mass. The gyroscopic effect
+    and the second plane are left out.
     """
     shear, bend = 12 * shaft.EI / shaft.length**3, 4 * shaft.EI / shaft.length
     none = jnp.zeros_like(shear[:1])
@@ -153,9 +199,7 @@ def mechanism_shapes(shaft: Shaft, x: Array) -> Array:
     turns about its centre of mass.
     """
     lanes, shaft = shaft.lanes, shaft.spread()
-    ends = jnp.concatenate([jnp.zeros_like(shaft.length[:1]), jnp.cumsum(shaft.length, axis=0)])
-    ends = ends / ends[-1]
-    at_ends = _motions(shaft, ends, ends)
+    ends, at_ends = _at_ends(shaft)
     combination = _unrestrained(shaft, at_ends)
     mass = _masses(shaft, at_ends, ends)
     columns, found = [], []
@@ -171,6 +215,13 @@ def mechanism_shapes(shaft: Shaft, x: Array) -> Array:
     sorted_columns = jnp.take_along_axis(jnp.stack(columns, axis=1), order[None], axis=1)
     stations = jnp.broadcast_to(x.reshape(len(x), *(1,) * len(lanes)), (len(x), *lanes))
     return jnp.swapaxes(matmul(_motions(shaft, stations, ends), sorted_columns), 0, 1)
+
+
+def _at_ends(shaft: Shaft) -> tuple[Array, Array]:
+    """The nodes, over the whole length, and the motions there."""
+    ends = jnp.concatenate([jnp.zeros_like(shaft.length[:1]), jnp.cumsum(shaft.length, axis=0)])
+    ends = ends / ends[-1]
+    return ends, _motions(shaft, ends, ends)
 
 
 def _motions(shaft: Shaft, x: Array, ends: Array) -> Array:

@@ -24,6 +24,8 @@ Complex = tuple[Array, ...]
 
 _EPS = np.finfo(float).eps
 _MAX_SWEEPS = 40
+# Smallest ratio of a single pivot to the largest entry beside the diagonal (Bunch & Parlett, SIAM J. Numer. Anal. 8, 1971).
+_PIVOT = (1 + 17**0.5) / 8
 
 
 def matmul(a: Array, b: Array) -> Array:
@@ -94,6 +96,31 @@ def _eliminated(a: Array, b: Array) -> tuple[Array, Array, Array]:
     start = (jnp.concatenate([a, b], axis=1), jnp.zeros(a.shape[2:], bool), jnp.ones(a.shape[2:]))
     system, negative, size = jax.lax.fori_loop(0, n, eliminate, start)
     return system[:, n:], negative, size
+
+
+def inertia_and_determinant(matrix: Array) -> tuple[Array, Array]:
+    """Number of negative eigenvalues of a symmetric matrix, and its determinant: elimination with the largest pivots."""
+    n = len(matrix)
+    number, diagonal = np.arange(n), np.eye(n, dtype=bool)
+
+    def eliminate(_: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        a, negative, determinant = state
+        beside = jnp.where(diagonal, 0.0, jnp.abs(a))
+        i, (j, k) = jnp.argmax(jnp.abs(jnp.diagonal(a))), jnp.divmod(jnp.argmax(beside), n)
+        single = jnp.abs(a[i, i]) >= _PIVOT * jnp.max(beside)
+        det = jnp.where(single, a[i, i], a[j, j] * a[k, k] - a[j, k] ** 2)
+        done = det == 0
+        safe = jnp.where(done, 1.0, det)
+        cross = jnp.outer(a[j], a[k])
+        two = a[k, k] * jnp.outer(a[j], a[j]) - a[j, k] * (cross + cross.T) + a[j, j] * jnp.outer(a[k], a[k])
+        rest = a - jnp.where(single, jnp.outer(a[i], a[i]), two) / safe
+        gone = jnp.where(single, number == i, (number == j) | (number == k))
+        rest = jnp.where(gone[:, None] | gone, 0.0, rest)
+        # A pair of pivots has one negative eigenvalue, and so a negative determinant.
+        return jnp.where(done, a, rest), negative + (det < 0), determinant * safe
+
+    _, negative, determinant = jax.lax.fori_loop(0, n, eliminate, (matrix, jnp.zeros(()), jnp.ones(())))
+    return negative, determinant
 
 
 def spectral_norm(a: Array) -> Array:
