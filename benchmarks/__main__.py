@@ -29,6 +29,7 @@ STUDIES = {
     "cardan": ("cardan:STUDY", "cardan:AGAINST_DAMPING", "cardan:GRADIENTS", "cardan:FORCED", "chart:STUDY", "chart:ATLAS",
                "waiting"),
     "bicardan": ("bicardan:STUDY",),
+    "driveline": ("driveline:STUDY",),
     "planetary": ("planetary:STUDY",),
     "rattle": ("rattle:STUDY", "rattle:ATTRACTORS"),
     "tripod": ("tripod:STUDY",),

@@ -30,6 +30,7 @@ TITLES = {
     "damping": "Cardan shaft against damping, Omega = 0.1",
     "gradients": "Cardan shaft: gradient of the spectral radius",
     "forced": "Cardan shaft: forced motion",
+    "driveline": "Driveline of three joints and six inertias, one core",
     "bicardan": "Stepped shaft: critical speeds",
     "planetary": "Planetary gear: natural frequencies",
     "rattle": "Gear rattle: motion with backlash",

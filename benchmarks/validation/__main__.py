@@ -8,7 +8,7 @@ from importlib import import_module
 
 import benchmarks.validation
 
-SYSTEMS = ("cardan", "tripod", "bicardan", "planetary", "rattle")
+SYSTEMS = ("cardan", "driveline", "tripod", "bicardan", "planetary", "rattle")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -187,7 +187,9 @@ def test_slow_modes_beside_fast_ones_keep_their_digits(direct, rtol):
     found = direct({name: np.array(values) for name, values in SLOW_BESIDE_FAST.items()}, rtol=rtol)
     error, bound = np.abs(found["spectral_radius"] - RADII), found["spectral_radius_error"]
     assert (error <= bound / 2).all(), error / bound
-    assert (error <= 2e-11 * RADII).all() and (bound <= 4e-10 * RADII).all(), (error / RADII, bound / RADII)
+    # A bound may reach ten times the tolerance, or the limit of rounding.
+    assert (error <= 2e-11 * RADII).all(), error / RADII
+    assert (bound <= max(10 * rtol, 4e-10) * RADII).all(), bound / RADII
 
 
 def test_errors_that_cancel_in_the_product_do_not_deceive(direct):

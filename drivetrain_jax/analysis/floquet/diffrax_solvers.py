@@ -54,7 +54,7 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
 
     def solve(values: Mapping[str, Any], steps: Array) -> dict[str, Array]:
         model = build(values)
-        shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in values.values() if not isinstance(x, str)))
+        shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in jax.tree.leaves(dict(values)) if not isinstance(x, str)))
         order = solver.order(model.reduced)
 
         def propagate(steps: Array) -> Array:
