@@ -68,7 +68,7 @@ def did_you_mean(name: str, allowed: Iterable[str]) -> str:
 def meant(name: str, parameters: Iterable[Any]) -> str:
     """``(did you mean X?)`` for the parameters with a similar name, else for those whose meaning or unit is ``name``."""
     known, words = list(parameters), name.lower().replace("_", " ")
-    if guess := did_you_mean(name, [each.name for each in known]):
+    if guess := did_you_mean(name, [parameter.name for parameter in known]):
         return guess
     alike = [p.name for p in known if words == p.units or (len(words) > 2 and words in p.long_name.lower())]
     return f" (did you mean {' or '.join(alike[:4])}?)" if alike else ""

@@ -14,15 +14,15 @@ from pathlib import Path
 def _processor() -> dict[str, str]:
     """Name and instruction-set flags of the processor, if the system reports them."""
     wanted = {"model name": "name", "flags": "flags", "Features": "flags"}
-    found: dict[str, str] = {}
+    fields: dict[str, str] = {}
     try:
         for line in Path("/proc/cpuinfo").read_text(errors="replace").splitlines():
             key, _, value = line.partition(":")
             if key.strip() in wanted:
-                found.setdefault(wanted[key.strip()], value.strip())
+                fields.setdefault(wanted[key.strip()], value.strip())
     except OSError:
         pass
-    return found
+    return fields
 
 
 def instruction_set() -> frozenset[str]:

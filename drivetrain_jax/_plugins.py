@@ -27,15 +27,15 @@ def load_plugin(group: str, name: str, wanted: str, is_wanted: Callable[[Any], b
     """
     for entry in entry_points(group=group, name=name):
         try:
-            found = entry.load()
+            plugin = entry.load()
         # Code of another package may raise anything.
         except Exception as error:
             raise ImportError(f"{entry.value} cannot be loaded: {type(error).__name__}: {error}") from error
-        if not is_wanted(found):
-            raise ImportError(f"{entry.value} is of type {type(found).__name__}, not {wanted}")
-        if getattr(found, "name", name) != name:
-            raise ImportError(f"{entry.value} is named {found.name}, not {name}")
-        return found
+        if not is_wanted(plugin):
+            raise ImportError(f"{entry.value} is of type {type(plugin).__name__}, not {wanted}")
+        if getattr(plugin, "name", name) != name:
+            raise ImportError(f"{entry.value} is named {plugin.name}, not {name}")
+        return plugin
     return None
 
 
@@ -48,13 +48,13 @@ def call_plugin(
     """
     entry = next((entry.value for entry in entry_points(group=group, name=name)), name)
     try:
-        found = function(*arguments)
+        result = function(*arguments)
     except (InputError, MemoryError):
         raise
     # Code of another package may raise anything.
     except Exception as error:
         text = " ".join(str(error).split())
         raise InputError(f"{what} {entry} raised {type(error).__name__}: {text}; allowed is {allowed}") from error
-    if not isinstance(found, kind):
-        raise InputError(f"{what} {entry} returned {type(found).__name__}; allowed is {allowed}")
-    return found
+    if not isinstance(result, kind):
+        raise InputError(f"{what} {entry} returned {type(result).__name__}; allowed is {allowed}")
+    return result

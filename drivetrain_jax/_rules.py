@@ -173,8 +173,8 @@ _MARGIN = 2e-8
 
 def _branches_fall(ds: xr.Dataset) -> xr.DataArray:
     amplitude = ds["branch_amplitude"]
-    own = [dim for dim in amplitude.dims if dim != "branch" and dim not in ds["outcome"].dims]
-    return amplitude.max(own).diff("branch") < -ROUNDING * amplitude.max([*own, "branch"])
+    inner = [dim for dim in amplitude.dims if dim != "branch" and dim not in ds["outcome"].dims]
+    return amplitude.max(inner).diff("branch") < -ROUNDING * amplitude.max([*inner, "branch"])
 
 
 def _stability_differs(ds: xr.Dataset) -> xr.DataArray:

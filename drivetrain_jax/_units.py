@@ -60,8 +60,8 @@ class UnitError(ValueError):
 
 def split(text: str) -> tuple[float, str] | None:
     """The number and the unit (which may be empty) at which ``text`` begins and ends; None without a number."""
-    found = _NUMBER.fullmatch(text)
-    return (float(found.group(1)), found.group(2)) if found else None
+    match = _NUMBER.fullmatch(text)
+    return (float(match.group(1)), match.group(2)) if match else None
 
 
 def misread(text: str) -> str:
@@ -106,18 +106,18 @@ def with_unit(value: Any) -> Any:
 
 
 def _texts(numbers: Any, unit: str) -> Any:
-    return [_texts(each, unit) for each in numbers] if isinstance(numbers, list) else f"{numbers!r} {unit}"
+    return [_texts(number, unit) for number in numbers] if isinstance(numbers, list) else f"{numbers!r} {unit}"
 
 
 @lru_cache(maxsize=256)
 def factor(unit: str, units: str) -> float:
     """The number of ``units`` that one ``unit`` is. Raises :class:`UnitError` as :func:`number` does."""
-    given, wanted = _parsed(unit), _parsed("" if units == "1" else units)
-    if given.dimensionality != wanted.dimensionality and "/rad" in units:
-        given = given / _parsed("rad")
-    if given.dimensionality != wanted.dimensionality:
+    written, wanted = _parsed(unit), _parsed("" if units == "1" else units)
+    if written.dimensionality != wanted.dimensionality and "/rad" in units:
+        written = written / _parsed("rad")
+    if written.dimensionality != wanted.dimensionality:
         raise UnitError(f"{unit} is a unit of another quantity")
-    exact = float((given / wanted).to_base_units().magnitude)
+    exact = float((written / wanted).to_base_units().magnitude)
     # A power of ten is written exactly, whatever way led to it.
     short = float(f"{exact:.12g}")
     return short if math.isclose(short, exact, rel_tol=1e-15) else exact

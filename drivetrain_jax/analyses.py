@@ -103,17 +103,17 @@ def analyse(name: str, system: System, outputs: Sequence[str] | None, options: M
     """The analysis ``name`` of one ``system``; see the module's docstring."""
     job, parameters = _job(name, system, outputs, options)
     if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(parameters)):
-        found = _pure(job)(parameters)
+        values = _pure(job)(parameters)
     else:
-        found = _concrete(job, parameters)
-    return Result({name: x[0] for name, x in found.items()} if job.single else found)
+        values = _concrete(job, parameters)
+    return Result({name: x[0] for name, x in values.items()} if job.single else values)
 
 
 def model_and_analysis(name: str, system: Any) -> tuple[Model, Analysis]:
     """The model of ``system`` for the analysis ``name``, and this analysis for its class; ``InputError`` without one."""
     if not isinstance(system, System):
-        given = f"the class {system.__name__}" if isinstance(system, type) else f"a {type(system).__name__}"
-        raise InputError(f"system: got {given}; allowed is a system such as drivetrain_jax.Cardan(...)")
+        kind = f"the class {system.__name__}" if isinstance(system, type) else f"a {type(system).__name__}"
+        raise InputError(f"system: got {kind}; allowed is a system such as drivetrain_jax.Cardan(...)")
     try:
         # The model first: only a system with one declares what the analysis takes from its class.
         return get_analysis(name).model(type(system)), get_analysis(name).for_system(type(system))
@@ -233,10 +233,10 @@ def _apart(job: _Job, kind: str, batches: tuple[tuple[int, tuple[bool, ...]], ..
     it is part of the caller's.
     """
 
-    def function(given: Any) -> Any:
+    def function(arguments: Any) -> Any:
         if kind == "values":
-            return _solve(job, 0, given)
-        parameters, results = given
+            return _solve(job, 0, arguments)
+        parameters, results = arguments
         return job.analysis.derivatives(job.system, job.request, parameters, job.constants, results)  # pyright: ignore[reportOptionalCall]
 
     for batch, own in batches:
@@ -244,26 +244,26 @@ def _apart(job: _Job, kind: str, batches: tuple[tuple[int, tuple[bool, ...]], ..
     inlined, lanes = custom_vmap(jax.jit(function)), math.prod(batch for batch, _ in batches)
 
     @inlined.def_vmap
-    def _(batch: int, batched: Any, given: Any) -> Any:
-        found = _apart(job, kind, (*batches, (batch, tuple(jax.tree.leaves(batched[0])))))(given)
-        return found, jax.tree.map(lambda _: True, found)
+    def _(batch: int, batched: Any, arguments: Any) -> Any:
+        results = _apart(job, kind, (*batches, (batch, tuple(jax.tree.leaves(batched[0])))))(arguments)
+        return results, jax.tree.map(lambda _: True, results)
 
     @cache
     def program() -> Callable[..., Any]:
         return _program(job, function, f"{kind} {batches}", lanes)
 
-    def call(given: Any) -> Any:
-        if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(given)):
-            return inlined(given)
-        return _concrete(job, given) if kind == "values" and not batches else program()(given)
+    def call(arguments: Any) -> Any:
+        if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arguments)):
+            return inlined(arguments)
+        return _concrete(job, arguments) if kind == "values" and not batches else program()(arguments)
 
     return call
 
 
-def _mapped(function: Callable[[Any], Any], batch: int, own: tuple[bool, ...], given: Any) -> Any:
-    """``function`` of every member of a batch, in which the leaves ``own`` of ``given`` have a first axis."""
-    leaves, tree = jax.tree.flatten(given)
-    axes = [0 if each else None for each in own]
+def _mapped(function: Callable[[Any], Any], batch: int, batched: tuple[bool, ...], arguments: Any) -> Any:
+    """``function`` of every member of a batch, in which the leaves ``batched`` of ``arguments`` have a first axis."""
+    leaves, tree = jax.tree.flatten(arguments)
+    axes = [0 if has_axis else None for has_axis in batched]
     return jax.vmap(lambda *x: function(jax.tree.unflatten(tree, x)), axes, axis_size=batch)(*leaves)
 
 
@@ -310,8 +310,8 @@ def _solve(job: _Job, index: int, parameters: Any, effort: Array | None = None) 
         lanes = max((x.shape[-1] for x in jax.tree.leaves(parameters) if x.ndim), default=1)
 
         def solve(values: Any, effort: Array, count: int) -> dict[str, Array]:
-            found = solver.solve(eqx.combine(values, constants.tree), effort)
-            return {name: _with_lanes(x, job.own_dims(name), count) for name, x in found.items()}
+            solved = solver.solve(eqx.combine(values, constants.tree), effort)
+            return {name: _with_lanes(x, job.own_dims(name), count) for name, x in solved.items()}
 
         if predict is None:
             return solve(parameters, effort, lanes)
@@ -322,9 +322,9 @@ def _solve(job: _Job, index: int, parameters: Any, effort: Array | None = None) 
         def block(part: Any, count: int) -> dict[str, Array]:
             return solve(part[0], jnp.max(part[1]), count)
 
-        found = in_blocks(block, in_order, lanes, _TOGETHER)
+        sorted_results = in_blocks(block, in_order, lanes, _TOGETHER)
         place = jnp.argsort(order)
-        return {name: x[..., place] for name, x in found.items()}
+        return {name: x[..., place] for name, x in sorted_results.items()}
 
     predict = solver.steps if effort is None else None
     if not jax.tree.leaves(parameters):
@@ -332,10 +332,10 @@ def _solve(job: _Job, index: int, parameters: Any, effort: Array | None = None) 
     return lanes_last(of_lanes, job.constants, parameters, jnp.int64(1) if effort is None else effort)
 
 
-def _with_lanes(result: Array, own: int, lanes: int) -> Array:
+def _with_lanes(result: Array, dims: int, lanes: int) -> Array:
     """``result`` with the lanes as last axis, also if it does not depend on the varying parameters."""
     result = jnp.asarray(result)
-    result = result if result.ndim > own else result[..., None]
+    result = result if result.ndim > dims else result[..., None]
     return jnp.broadcast_to(result, (*result.shape[:-1], lanes))
 
 

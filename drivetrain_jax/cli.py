@@ -504,17 +504,17 @@ def point(options: argparse.Namespace) -> int:
     """Print the results of one point."""
     from drivetrain_jax.runs.point import point
 
-    given = assignments(options.given, "point")
+    values = assignments(options.given, "point")
     asked = {"amplitude": options.amplitude, "sensitivities": options.sensitivities, "data": options.data}
     for name in ("system", "analysis", *asked):
-        if name in given:
+        if name in values:
             option = f"not a parameter; did you mean the option --{name}?"
             twice = "given twice; allowed is once, in front of the values"
-            raise InputError(f"{name} = {given[name]!r}: {option if name in asked else twice}")
-    outputs = given.pop("outputs", None)
+            raise InputError(f"{name} = {values[name]!r}: {option if name in asked else twice}")
+    outputs = values.pop("outputs", None)
     if isinstance(outputs, str):
         outputs = outputs.split(",")
-    return _answer(point(options.system, options.analysis, outputs=outputs, **asked, **given), options)
+    return _answer(point(options.system, options.analysis, outputs=outputs, **asked, **values), options)
 
 
 def query(options: argparse.Namespace) -> int:
@@ -522,9 +522,9 @@ def query(options: argparse.Namespace) -> int:
     from drivetrain_jax.runs.atlas_answers import query
     from drivetrain_jax.runs.atlas_file import open_atlas
 
-    given = ranges(options.given, "query")
+    values = ranges(options.given, "query")
     with _reading(options.file):
-        reply = query(open_atlas(options.file), given, options.amplitude)
+        reply = query(open_atlas(options.file), values, options.amplitude)
     return _answer(reply, options)
 
 
@@ -539,10 +539,10 @@ def design(options: argparse.Namespace) -> int:
     if options.vary and options.question == "speed-windows":
         raise InputError(f"--vary = {options.vary!r}: not used by speed-windows; allowed for the other questions")
     extra |= {"vary": options.vary} if options.vary else {}
-    given = ranges(options.given, "design")
+    values = ranges(options.given, "design")
     question = getattr(atlas_answers, options.question.replace("-", "_"))
     with _reading(options.file):
-        reply = question(open_atlas(options.file), given, amplitude=options.amplitude, **extra)
+        reply = question(open_atlas(options.file), values, amplitude=options.amplitude, **extra)
     return _answer(reply, options)
 
 

@@ -141,12 +141,12 @@ def declared(analysis: str) -> Declared:
     if analysis in BUILT_IN:
         return BUILT_IN[analysis]
     try:
-        found = load_plugin(RULES, analysis, "the rules of an analysis", lambda x: isinstance(x, Declared))
+        rules = load_plugin(RULES, analysis, "the rules of an analysis", lambda x: isinstance(x, Declared))
     except ImportError as error:
         raise InputError(f"analysis = {analysis!r}: {' '.join(str(error).split())}") from error
-    if found is None:
+    if rules is None:
         return Declared()
-    return replace(found, rules=tuple(_of_plugin(rule, analysis) for rule in found.rules))
+    return replace(rules, rules=tuple(_of_plugin(rule, analysis) for rule in rules.rules))
 
 
 def _of_plugin(rule: Rule, analysis: str) -> Rule:

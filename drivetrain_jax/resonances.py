@@ -157,8 +157,8 @@ def torsional_frequencies(values: Values) -> np.ndarray:
     ratio = np.asarray(values.get("ratio") or np.ones(len(k)), float)
     twists = np.eye(len(k)) - np.diag(ratio[1:], -1)
     factor = np.sqrt(k)[:, None] * twists / np.sqrt(inertia)
-    found = np.linalg.svd(factor, compute_uv=False)[::-1][:_MODES]
-    return np.pad(found, (0, _MODES - len(found)), constant_values=np.nan)
+    frequencies = np.linalg.svd(factor, compute_uv=False)[::-1][:_MODES]
+    return np.pad(frequencies, (0, _MODES - len(frequencies)), constant_values=np.nan)
 
 
 def driveline_resonances(orders: int = 2) -> Resonances:

@@ -22,8 +22,7 @@ MAKERS = (
     ("30 and 20, well phased", (30, 20), 90, math.sqrt(30**2 - 20**2), None),
     ("30 and 30, badly phased", (30, 30), 0, math.sqrt(2 * 30**2), 4 / 3 - 3 / 4),
 )
-# Two equal joints and a light tube, in SI units: a rigid driven end, an axle whose first torsional frequency is far below that
-# of the tube.
+# Two equal joints, badly phased, with a light tube between them and an inertia behind them, in SI units.
 DOUBLE: dict[str, Any] = {
     "k": [9e3, 8e3], "c": [0.5, 0.5], "J": [0.03, 0.5], "beta": [math.radians(20)] * 2, "phase": [0.0, 0.0],
 }  # fmt: skip
@@ -122,7 +121,7 @@ def multipliers() -> str:
         rows.append([case["name"], str(len(chain["k"])), str(joints), f"{np.abs(found).max():.12f}",
                      f"{np.abs(exact).max():.12f}", *(f"{x:.0e}" for x in apart)])  # fmt: skip
     text = (
-        "Spectral radii of eq. (A), and the largest distance of a multiplier from values in 80 bits (Bulirsch & Stoer) and "
+        "Spectral radii of eq. (A), and the largest distance of a multiplier from values in 80 bits and "
         "from SciPy's solution of equations with Lagrange multipliers, in which the pins of a joint are perpendicular in "
         "space and no ratio of speeds is used. No published chart of a driveline with several joints has numbers.\n"
     )
@@ -135,7 +134,8 @@ def page(full: bool) -> Page:
     del full
     introduction = (
         "Rules of makers and published properties of drivelines with several Hooke joints against this package, and its "
-        "multipliers against two independent computations. The equations are in [theory/driveline.md](../theory/driveline.md)."
+        "multipliers against two independent computations. The equations are in "
+        "[theory/driveline.md](../theory/driveline.md)."
     )
     sections = [section() for section in (makers, double_joint, half_critical_speed, multipliers)]
     return Page("Validation of the driveline", introduction, sections)

@@ -295,10 +295,10 @@ def checked_solvers(
     if analysis.continuous:
         return tuple(analysis.solvers(system, request))
     path = analysis.path_axis(system, request) is not None
-    sizes = {each.name: len(each.values) for each in dimensions}
+    sizes = {solver.name: len(solver.values) for solver in dimensions}
     return tuple(
-        replace(each, solve=_CheckedSolve(analysis, request, path, sizes, each.solve))
-        for each in analysis.solvers(system, request)
+        replace(solver, solve=_CheckedSolve(analysis, request, path, sizes, solver.solve))
+        for solver in analysis.solvers(system, request)
     )
 
 

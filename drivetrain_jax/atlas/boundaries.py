@@ -62,7 +62,7 @@ def boundaries(atlas: Atlas, system: type[System], searches: Sequence[Search] = 
         raise ValueError(f"parameters = {', '.join(atlas.parameters)}: allowed are two; slice the atlas first")
     criteria = Criteria.of(atlas, system)
     patches = patches_of(criteria)
-    found: list[Boundary] = []
+    curves: list[Boundary] = []
     horizontal = _narrow_axis(atlas, system)
     for number, kind in enumerate(criteria.multipliers):
         zeros, tips = ZeroSet(patches[number], horizontal), np.empty((0, 2))
@@ -71,8 +71,8 @@ def boundaries(atlas: Atlas, system: type[System], searches: Sequence[Search] = 
             fine = polish(criteria, rough, kind, horizontal)[0]
             near = (np.abs(fine - rough) < _LARGEST_SHIFT * zeros.scale).all(axis=1)
             tips = np.where(near[:, None], fine, rough)
-        found += [_finish(criteria, zeros, kind, curve) for curve in zeros.curves(tips)]
-    return tuple(found)
+        curves += [_finish(criteria, zeros, kind, curve) for curve in zeros.curves(tips)]
+    return tuple(curves)
 
 
 def _narrow_axis(atlas: Atlas, system: type[System]) -> int:
@@ -119,12 +119,14 @@ class ZeroSet:
     def _rim(self) -> np.ndarray:
         """Crossings with the two sides along v, ``(K, 2)``."""
         ends = [self.lower[self.h], self.upper[self.h]]
-        found = [roots(on_line(self._patches, self.h, float(end))).x for end in ends]
-        return np.concatenate([np.insert(x[:, None], self.h, end, axis=1) for x, end in zip(found, ends, strict=True)])
+        crossings = [roots(on_line(self._patches, self.h, float(end))).x for end in ends]
+        return np.concatenate(
+            [np.insert(x[:, None], self.h, end, axis=1) for x, end in zip(crossings, ends, strict=True)]
+        )
 
     def _on_lines(self, heights: Sequence[float]) -> dict[float, np.ndarray]:
         """The zeros on lines, ``(n, 2)`` by the position of the line; neighbours have slopes of different signs."""
-        found, width = {}, 2 * self.scale[self.h]
+        zeros, width = {}, 2 * self.scale[self.h]
         for part in (heights[i : i + _TOGETHER] for i in range(0, len(heights), _TOGETHER)):
             # All lines one behind the other are one line.
             values = self._points(0.0, np.zeros(len(part)))[:, self.v] + np.array(part) * self.scale[self.v]
@@ -141,8 +143,8 @@ class ZeroSet:
                 # A zero on a common face of two patches may be found twice.
                 new = sign != np.concatenate([[0.0], sign[:-1]])
                 x = np.clip(all_zeros.x[mine][new] - k * width, self.lower[self.h], self.upper[self.h])
-                found[height] = np.column_stack([self._points(height, x), sign[new]])
-        return found
+                zeros[height] = np.column_stack([self._points(height, x), sign[new]])
+        return zeros
 
     def _linked(
         self, known: Mapping[float, np.ndarray], tips: np.ndarray, rim: np.ndarray

@@ -100,10 +100,11 @@ def evaluated_tiles(
         for name in names[-3:-2]:
             values[name] = filled_up(np.repeat(values[name], tile.rows), len(tile.first))
         factors = (tile.first, tile.columns) if tile.spread is None else (tile.first, tile.columns, tile.spread)
-        found = kernel(tile.spread is not None)(*factors, tile.panel.value_error, values, constants, rtol)
+        cells_of_tile = kernel(tile.spread is not None)(*factors, tile.panel.value_error, values, constants, rtol)
         shape = (places, tile.rows, -1)[-min(len(names), 3) :]
         return {
-            name: np.asarray(x)[: places * tile.rows].reshape(shape)[..., :rows, :columns] for name, x in found.items()
+            name: np.asarray(x)[: places * tile.rows].reshape(shape)[..., :rows, :columns]
+            for name, x in cells_of_tile.items()
         }
 
     return in_threads(tiles, work)

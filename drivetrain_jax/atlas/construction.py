@@ -190,23 +190,23 @@ class _Construction:
 
     def panel(self, box: Box) -> Panel:
         """The panel of a box; raises :class:`_Unresolved` if it has none."""
-        function, given, truncated = self._function, [_FIRST] * len(box.lower), np.inf
+        function, degrees, truncated = self._function, [_FIRST] * len(box.lower), np.inf
         if function.degrees:
-            given, truncated = function.degrees(box.lower, box.upper)
-        if max(given) > _MOST_GIVEN:
-            given, truncated = [_FIRST] * len(given), np.inf
+            degrees, truncated = function.degrees(box.lower, box.upper)
+        if max(degrees) > _MOST_GIVEN:
+            degrees, truncated = [_FIRST] * len(degrees), np.inf
         known = function.start is not None and np.isfinite(truncated)
-        waiting = function.start(box.axes(given)) if known else None  # pyright: ignore[reportOptionalCall]
+        waiting = function.start(box.axes(degrees)) if known else None  # pyright: ignore[reportOptionalCall]
         # While the nodes are computed.
-        x = box.place(_held_out(len(given)))
+        x = box.place(_held_out(len(degrees)))
         self._error = 0.0
         checks = x, self._solve(x)
         panel = None
         if waiting is not None:
-            panel = self._fit(box, given, waiting(), checks, truncated)[0]
+            panel = self._fit(box, degrees, waiting(), checks, truncated)[0]
         elif function.start:
-            panel = self._adapted(box, given, checks, function.start)
-        return panel or self._adapted(box, [_FIRST] * len(given), checks, self._solved)  # pyright: ignore[reportReturnType]
+            panel = self._adapted(box, degrees, checks, function.start)
+        return panel or self._adapted(box, [_FIRST] * len(degrees), checks, self._solved)  # pyright: ignore[reportReturnType]
 
     def _solve(self, x: np.ndarray) -> np.ndarray:
         """Values at points ``(N, d)``; raises if solves fail or are too many."""

@@ -84,10 +84,10 @@ class Criteria:
 
     def propagator(self, x: np.ndarray, order: tuple[int, ...] = ()) -> np.ndarray:
         """``Phi`` or its derivative of ``order`` per coordinate, ``(N, d) -> (16, N)``, NaN outside the panels."""
-        found = self.atlas.find(x)
+        panel_of = self.atlas.find(x)
         values = np.full((_STATES**2, len(x)), np.nan)
-        for number in np.unique(found[found >= 0]):
-            mine = found == number
+        for number in np.unique(panel_of[panel_of >= 0]):
+            mine = panel_of == number
             panel = self.atlas.panels[number]
             values[:, mine] = interpolation.evaluate(derivative(panel, order), position(panel, x[mine])).T
         return values
@@ -182,8 +182,8 @@ class Criteria:
     def _values(self, x: np.ndarray) -> dict[str, np.ndarray]:
         columns = dict(zip(self.atlas.parameters, parameters_at(self.atlas, x).T, strict=True))
         names = self.system.models["floquet"].parameters
-        given = {name: columns.get(name, self.atlas.fixed.get(name)) for name in names}
-        return {name: np.broadcast_to(np.asarray(v, float), len(x)) for name, v in given.items() if v is not None}
+        parameters = {name: columns.get(name, self.atlas.fixed.get(name)) for name in names}
+        return {name: np.broadcast_to(np.asarray(v, float), len(x)) for name, v in parameters.items() if v is not None}
 
 
 def parameters_at(atlas: Atlas, x: np.ndarray) -> np.ndarray:
@@ -288,15 +288,14 @@ def growth(criteria: Criteria, x: np.ndarray, kinds: list[str], *, second: bool 
         return Growth(np.log(np.abs(s)), (ds / s[:, None]).real, hessian, error)
 
 
-def limiting(criteria: Criteria, x: np.ndarray, own: Growth) -> np.ndarray:
-    """Flags ``(N,)`` of points ``x`` at which no multiplier except ``own`` grows.
+def limiting(criteria: Criteria, x: np.ndarray, multiplier: Growth) -> np.ndarray:
+    """Flags ``(N,)`` of points ``x`` at which no other multiplier than ``multiplier`` grows.
 
-    The multipliers ``own`` are on the unit circle up to their rates. With little damping growth rates within a tongue are
-    small.
+    That one is on the unit circle up to its rate. With little damping growth rates within a tongue are small.
     """
     largest = growth(criteria, x, ["largest"] * len(x))
     with np.errstate(invalid="ignore"):
-        bound = np.fmin(np.abs(own.rate) + own.error + largest.error, LIMITING)
+        bound = np.fmin(np.abs(multiplier.rate) + multiplier.error + largest.error, LIMITING)
         return np.log(criteria.spectral_radius(x)) <= bound
 
 
@@ -360,8 +359,8 @@ def _derivatives(criteria: Criteria, x: np.ndarray, order: int) -> Any:
 
 def monodromy_error(criteria: Criteria, x: np.ndarray, phi: np.ndarray) -> np.ndarray:
     """Bound of the norm of the error of Z at points where the propagator is ``phi``, ``(N,)``; inf outside the panels."""
-    found = criteria.atlas.find(x)
+    panel_of = criteria.atlas.find(x)
     errors = np.array([panel.value_error for panel in criteria.atlas.panels])
-    error = np.where(found >= 0, errors[np.maximum(found, 0)], np.inf)
+    error = np.where(panel_of >= 0, errors[np.maximum(panel_of, 0)], np.inf)
     size = np.sqrt((phi**2).sum(axis=0))
     return 2 * size * (error + 8 * np.finfo(float).eps * size)

@@ -133,8 +133,8 @@ def _along_ridge(
     foot = ridge_roots(function, part.to_coordinates(tip), 1 - k, bottom)[0]
     if not np.isfinite(foot):
         return (place,)
-    found = part.to_parameters(np.insert([foot], k, bottom)[None])[0, 1 - k]
-    return (float(np.clip(found, low, high)),)
+    position = part.to_parameters(np.insert([foot], k, bottom)[None])[0, 1 - k]
+    return (float(np.clip(position, low, high)),)
 
 
 def _worst(criteria: Criteria, k: int, value: float) -> float:
@@ -356,14 +356,14 @@ def _shortened(interval: Interval, part: Atlas, margin: float) -> Range:
 
 def nearest_boundaries(atlas: Atlas, system: type[System], point: Mapping[str, float]) -> tuple[Nearest, ...]:
     """The nearest changes of stability along every parameter of ``atlas`` from ``point``, one parameter at a time."""
-    found = []
+    nearest = []
     for name in atlas.parameters:
         others = {other: point[other] for other in atlas.parameters if other != name}
         line = stability_along(atlas.slice(others), system)
         value = float(point[name])
         below = [c for c in line.crossings if c.value <= value]
         above = [c for c in line.crossings if c.value > value]
-        found.append(
+        nearest.append(
             Nearest(
                 name,
                 value,
@@ -372,7 +372,7 @@ def nearest_boundaries(atlas: Atlas, system: type[System], point: Mapping[str, f
                 line.undecided,
             )
         )
-    return tuple(found)
+    return tuple(nearest)
 
 
 def _extreme(atlas: Atlas, system: type[System], speeds: Range, side: float, direct: Direct | None) -> Answer:

@@ -81,7 +81,7 @@ def tiles(
         bands = _kinds_first(list(_bands(panel, axes[-1], groups[-1], degrees[1], shape[1], dense)))
         rows, places, total = _stacked(axes, len(groups[-2]), largest, shape)
         for fixed, reduced in _runs(_reductions(panel, axes, groups[:-2]), places):
-            tensors = filled_up(np.stack([_padded(each, degrees) for each in reduced]), places)
+            tensors = filled_up(np.stack([_padded(panel_of_place, degrees) for panel_of_place in reduced]), places)
             for start in range(0, len(groups[-2]), rows):
                 chosen = groups[-2][start : start + rows]
                 weights = filled_up(chebyshev(_positions(panel, -2, axes[-2][chosen]), degrees[0]), rows)
@@ -115,7 +115,7 @@ def _runs(
     for _, line in groupby(reductions, key=lambda reduction: reduction[0][:-1]):
         while run := list(islice(line, most)):
             places, panels = zip(*run, strict=True)
-            yield tuple(np.unique(each) for each in zip(*places, strict=True)), list(panels)
+            yield tuple(np.unique(positions) for positions in zip(*places, strict=True)), list(panels)
 
 
 @partial(jax.jit, static_argnames="total")
@@ -125,8 +125,8 @@ def _first_product(weights: Array, tensors: Array, total: int) -> Array:
     The BLAS threads of NumPy would compete with the worker threads.
     """
     k, n, *rest = tensors.shape
-    found = jnp.einsum("rn,knx->krx", weights, tensors.reshape(k, n, -1)).reshape(-1, *rest)
-    return jnp.pad(found, ((0, total - len(found)), (0, 0), (0, 0)))
+    product = jnp.einsum("rn,knx->krx", weights, tensors.reshape(k, n, -1)).reshape(-1, *rest)
+    return jnp.pad(product, ((0, total - len(product)), (0, 0), (0, 0)))
 
 
 def _reductions(

@@ -51,7 +51,7 @@ def critical_points(patches: tuple[Patches, ...], number: int, horizontal: int) 
     """
     lower, upper = patches[0].lower.min(axis=0), patches[0].upper.max(axis=0)
     smallest = _SMALLEST * (upper - lower)
-    found, undecided = [], []
+    roots, undecided = [], []
     active, others = patches[number], patches[:number] + patches[number + 1 :]
     while len(active):
         keep = ~_excluded_by_value(active, others)
@@ -61,7 +61,7 @@ def critical_points(patches: tuple[Patches, ...], number: int, horizontal: int) 
         chosen = np.flatnonzero(~bundle.excluded() & ~unclear)
         enlarged = bundle.take(chosen).enlarged()
         single = enlarged.single()
-        found.append(enlarged.take(single).root())
+        roots.append(enlarged.take(single).root())
         rest = np.concatenate([chosen[~single], np.flatnonzero(unclear)])
         active, others = active.take(rest), tuple(p.take(rest) for p in others)
         small = ((active.upper - active.lower) <= smallest).all(axis=1) | ~np.isfinite(active.error)
@@ -72,7 +72,7 @@ def critical_points(patches: tuple[Patches, ...], number: int, horizontal: int) 
         active, others = active.take(~small), tuple(p.take(~small) for p in others)
         axes = active.steepest_axis()
         active, others = active.split(axes), tuple(p.split(axes) for p in others)
-    points, curvature, slope, boxes = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    points, curvature, slope, boxes = (np.concatenate(parts) for parts in zip(*roots, strict=True))
     # Boxes at the rim are enlarged beyond it.
     beyond = (np.maximum(lower - points, points - upper) > _RIM * (upper - lower)).any(axis=1)
     points, curvature, slope, boxes = (part[~beyond] for part in (points, curvature, slope, boxes))

@@ -130,7 +130,7 @@ def _function(
 
     def solved(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         points = domain.points(at)
-        values, errors = (balanced(points, each) for each in np.split(np.asarray(solve(points), float), 2, axis=1))
+        values, errors = (balanced(points, part) for part in np.split(np.asarray(solve(points), float), 2, axis=1))
         return values, np.linalg.norm(errors, axis=1)
 
     def scale(values: np.ndarray) -> np.ndarray:
@@ -291,15 +291,15 @@ class SeriesNodes:
 
         def values() -> np.ndarray:
             try:
-                found = np.empty((len(parts), *pending[0].result().shape[1:]))
+                propagators = np.empty((len(parts), *pending[0].result().shape[1:]))
                 for chosen, future in zip(chunks, pending, strict=True):
-                    found[chosen] = future.result()[: len(chosen)]
+                    propagators[chosen] = future.result()[: len(chosen)]
             finally:
                 for future in pending:
                     future.cancel()
             counts = [len(axis) for k, axis in enumerate(axes) if k != self.axis]
-            found = np.moveaxis(found[:, :count].reshape(*counts, count, -1), -2, self.axis)
-            return found.reshape(-1, found.shape[-1])
+            propagators = np.moveaxis(propagators[:, :count].reshape(*counts, count, -1), -2, self.axis)
+            return propagators.reshape(-1, propagators.shape[-1])
 
         return values
 

@@ -68,9 +68,9 @@ def evaluate(tensor: np.ndarray, x: np.ndarray) -> np.ndarray:
     out = np.empty((len(x), tensor.shape[-1]))
     first, rest = tensor.reshape(len(tensor), -1), tensor.shape[1:]
     block = max(_WORKING_SET // first.shape[1], _LEAST)
-    lines, own = np.unique(x[:, 0], return_inverse=True)
+    lines, line_of = np.unique(x[:, 0], return_inverse=True)
     if x.shape[1] > 1 and 0 < _SHARED * len(lines) <= len(x):
-        chosen = np.split(np.argsort(own, kind="stable"), np.cumsum(np.bincount(own))[:-1])
+        chosen = np.split(np.argsort(line_of, kind="stable"), np.cumsum(np.bincount(line_of))[:-1])
         for k, mine in enumerate(chosen):
             row = _product(chebyshev(lines[k : k + 1], len(tensor)), first)
             out[mine] = evaluate(row.reshape(rest), x[mine, 1:])

@@ -92,10 +92,10 @@ class Atlas:
 
     def find(self, x: np.ndarray) -> np.ndarray:
         """Number of the panel of each point in coordinates, ``(N, d) -> (N,)``; -1 in a gap or outside the domain."""
-        found = np.full(len(x), -1)
+        numbers = np.full(len(x), -1)
         for number, panel in reversed(list(enumerate(self.panels))):
-            found[inside(panel, x)] = number
-        return found
+            numbers[inside(panel, x)] = number
+        return numbers
 
     def folded(self) -> Atlas:
         """The atlas over the moduli of the parameters whose coordinates are even."""

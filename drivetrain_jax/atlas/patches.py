@@ -338,7 +338,7 @@ def roots(patches: Patches) -> Roots:
         nothing = np.empty(0)
         return Roots(nothing, nothing, nothing, np.empty((0, 2)))
     smallest = _SMALLEST * (patches.upper.max() - patches.lower.min())
-    found, undecided = [], []
+    zeros, undecided = [], []
     active = patches
     while len(active):
         low, high = active.range()
@@ -350,7 +350,7 @@ def roots(patches: Patches) -> Roots:
         ends = [wide(np.full((len(wide), 1), t)) for t in (-1.0, 1.0)]
         certain = np.minimum(np.abs(ends[0]), np.abs(ends[1])) > wide.error
         crossing = monotone & certain & (ends[0] * ends[1] < 0)
-        found.append(_bisect(wide.take(crossing), slope.take(crossing)))
+        zeros.append(_bisect(wide.take(crossing), slope.take(crossing)))
         active = active.take(~(monotone & certain))
         small = (active.upper - active.lower)[:, 0] <= smallest
         # Where a function stays below its error, smaller intervals decide nothing either.
@@ -358,7 +358,7 @@ def roots(patches: Patches) -> Roots:
         undecided.append(np.stack([active.lower[small, 0], active.upper[small, 0]], axis=-1))
         active = active.take(~small)
         active = active.split(np.zeros(len(active), int))
-    x, error, slope = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    x, error, slope = (np.concatenate(parts) for parts in zip(*zeros, strict=True))
     order = np.argsort(x)
     x, error, slope = x[order], error[order], slope[order]
     # A zero on a common face was found from both sides.

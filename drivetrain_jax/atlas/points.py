@@ -100,18 +100,18 @@ class Expansion:
     @cached_property
     def _tails(self) -> list[list[np.ndarray]]:
         """Bounds of the truncation error with k polynomials, k = 0, 1, ..., for every panel and coordinate."""
-        found = []
+        of_panels = []
         for panel, restrictions in zip(self._atlas.panels, self._restrictions, strict=True):
             sizes = np.linalg.norm(panel.coefficients, axis=-1)
             tails, spread = [], 1.0
             for axis, boxes in enumerate(restrictions):
                 slabs = sizes.sum(axis=tuple(k for k in range(sizes.ndim) if k != axis))
-                each = np.max([np.abs(r) @ slabs for r in boxes], axis=0)
-                tails.append(np.append(spread * np.cumsum(each[::-1])[::-1], 0.0))
+                largest = np.max([np.abs(r) @ slabs for r in boxes], axis=0)
+                tails.append(np.append(spread * np.cumsum(largest[::-1])[::-1], 0.0))
                 # Factor by which expanding along this coordinate may amplify the truncation error of the others.
                 spread *= max(float(np.abs(r).sum(axis=0).max()) for r in boxes)
-            found.append(tails)
-        return found
+            of_panels.append(tails)
+        return of_panels
 
     @cached_property
     def _degrees(self) -> list[int]:
@@ -150,7 +150,7 @@ def evaluated_cells(
         numbers = np.minimum(np.arange(start, start + block), cell.index.size - 1)
         columns = points[cell.index[numbers]].T
         values, rows = dict(zip(atlas.parameters, columns, strict=True)), -(-(cell.index.size - start) // LANES)
-        found = kernel(
+        results = kernel(
             cell.tensor,
             cell.place[:, numbers],
             np.int32(min(rows, ROWS)),
@@ -159,11 +159,11 @@ def evaluated_cells(
             atlas.fixed,
             rtol,
         )
-        return {name: np.asarray(x)[: cell.index.size - start] for name, x in found.items()}
+        return {name: np.asarray(x)[: cell.index.size - start] for name, x in results.items()}
 
     parts = ((cell, start) for cell in expansion.cells(x) for start in range(0, cell.index.size, block))
-    for (cell, start), found in in_threads(parts, work):
-        yield cell.index[start : start + block], found
+    for (cell, start), results in in_threads(parts, work):
+        yield cell.index[start : start + block], results
 
 
 @lru_cache(maxsize=16)

@@ -111,8 +111,8 @@ def _bound(atlas: Atlas, panel: Panel, system: type[System]) -> float:
     def apart(piece: Mapping[str, np.ndarray]) -> float:
         """The largest distance between p and T Phi S at the nodes of some lines."""
         x, wrong, phi, error = enclosure.propagators(piece, atlas.fixed, middle_of(domain))
-        found, rounded = _evaluated(panel, x, wrong)
-        return float((frobenius(found - phi) + error + rounded).max())
+        values, rounded = _evaluated(panel, x, wrong)
+        return float((frobenius(values - phi) + error + rounded).max())
 
     cut = enclosure.varying[0]
     cuts = np.array_split(axes[cut], -(-len(axes[cut]) // _LINES)) if cut in axes else ()
@@ -145,8 +145,8 @@ def _evaluated(panel: Panel, x: np.ndarray, wrong: np.ndarray) -> tuple[np.ndarr
     for start in range(0, len(x), _POINTS):
         at = t[start : start + _POINTS]
         # Cells of a chart share lines.
-        lines, own = np.unique(at[:, 0], return_inverse=True)
-        rest = (chebvander(lines, panel.degrees[0] - 1) @ panel.coefficients.reshape(panel.degrees[0], -1))[own]
+        lines, line_of = np.unique(at[:, 0], return_inverse=True)
+        rest = (chebvander(lines, panel.degrees[0] - 1) @ panel.coefficients.reshape(panel.degrees[0], -1))[line_of]
         for k, n in enumerate(panel.degrees[1:], start=1):
             rest = np.einsum("pn,pnr->pr", chebvander(at[:, k], n - 1), rest.reshape(len(at), n, -1))
         values[start : start + _POINTS] = rest
@@ -167,9 +167,9 @@ def verdicts(atlas: Atlas, system: type[System], points: np.ndarray) -> np.ndarr
     The stored binary64 parameters count as exact. Stable: all multipliers lie inside the unit circle or, without damping,
     on it and apart from each other. Unstable: at least one lies outside.
     """
-    found, enclosure = np.full(len(points), UNDECIDED, np.int8), smoothness(system).enclosure
+    codes_of_all, enclosure = np.full(len(points), UNDECIDED, np.int8), smoothness(system).enclosure
     if enclosure is None or not any(np.isfinite(panel.proved_error) for panel in atlas.panels):
-        return found
+        return codes_of_all
     columns = [enclosure.coordinate(name, column) for name, column in zip(atlas.parameters, points.T, strict=True)]
     x, wrong = (np.stack(part, axis=-1) for part in zip(*columns, strict=True))
     number = atlas.find(atlas.to_coordinates(points))
@@ -182,8 +182,8 @@ def verdicts(atlas: Atlas, system: type[System], points: np.ndarray) -> np.ndarr
     covered = [np.flatnonzero(number == k) for k, panel in enumerate(atlas.panels) if np.isfinite(panel.proved_error)]
     blocks = (mine[i : i + _POINTS] for mine in covered for i in range(0, len(mine), _POINTS))
     for mine, codes in in_threads(blocks, judged):
-        found[mine] = codes
-    return found
+        codes_of_all[mine] = codes
+    return codes_of_all
 
 
 def verdict_at(system: type[System], values: Mapping[str, float]) -> int:
@@ -222,7 +222,7 @@ def _verdict(phi: np.ndarray, error: np.ndarray, log_d: np.ndarray) -> np.ndarra
         """Bound of the error of the sum of the e_k times these ``weights``."""
         weights = np.broadcast_arrays(*weights, size)[:3]
         slope = np.sum([weight[:, None, None] * a for weight, a in zip(weights, slopes, strict=True)], axis=0)
-        higher = sum(np.abs(weight) * each for weight, each in zip(weights, rest, strict=True))
+        higher = sum(np.abs(weight) * term for weight, term in zip(weights, rest, strict=True))
         return 2 * frobenius(slope) * error * (1 + 1e-9) + 1e-13 * size * (1 + norm) ** 2 * error + higher
 
     d, missing = np.exp(log_d), -np.expm1(log_d)

@@ -71,23 +71,23 @@ class StabilityAtlas:
         points = np.atleast_2d(np.asarray(points, float))
         if not (self.closed_form and _FAST.issuperset(outputs) and self.atlas.panels):
             return self.by_eigenvalues(points, outputs)
-        x, found = self.atlas.to_coordinates(points), self.blank((len(points),), outputs)
+        x, results = self.atlas.to_coordinates(points), self.blank((len(points),), outputs)
         undamped, few = self._may_be_undamped(points.T), len(points) <= LANES
         options = options_for_few() if few else compiler_options()
         kernel = self.keep(point_kernel(self.build, undamped, few), options, f"points {undamped}")
         unsure = [np.empty(0, int)]
         for index, cells in evaluated_cells(self._expansion, points, x, self.atlas, kernel, self.rtol):
-            for name, values in found.items():
+            for name, values in results.items():
                 values[index] = cells[name]
             unsure.append(index[cells["unsure"]])
         again = np.concatenate(unsure)
         for name, values in self.by_eigenvalues(points[again], outputs).items():
-            found[name][again] = values
-        return found
+            results[name][again] = values
+        return results
 
     def by_eigenvalues(self, points: np.ndarray, outputs: Sequence[str]) -> dict[str, np.ndarray]:
         """As :meth:`at`, but all points by the eigenvalues of Z."""
-        x, found = self.atlas.to_coordinates(points), self.blank((len(points),), outputs)
+        x, results = self.atlas.to_coordinates(points), self.blank((len(points),), outputs)
         number = self.atlas.find(x)
         for k, panel in enumerate(self.atlas.panels):
             mine = np.flatnonzero(number == k)
@@ -96,21 +96,21 @@ class StabilityAtlas:
                 part, lanes = mine[start : start + _BLOCK], phi[:, start : start + _BLOCK]
                 lanes = np.pad(lanes, ((0, 0), (0, _BLOCK - len(part))), mode="edge")
                 for name, value in self._exact_results(k, points[part], lanes, tuple(outputs)).items():
-                    found[name][part] = value[: len(part)]
-        return found
+                    results[name][part] = value[: len(part)]
+        return results
 
     def blank(self, shape: tuple[int, ...], outputs: Sequence[str] = DEFAULT_OUTPUTS) -> dict[str, np.ndarray]:
         """Results by name, and ``outcome``, of unknown points."""
-        found = self._empty(shape, outputs)
-        for name, values in found.items():
+        results = self._empty(shape, outputs)
+        for name, values in results.items():
             values[...] = _nothing(name, values)
-        return found
+        return results
 
     def _empty(self, shape: tuple[int, ...], outputs: Sequence[str]) -> dict[str, np.ndarray]:
         variables = {v.name: v for v in VARIABLES}
-        own = {name: (self._multipliers,) * len(variables[name].dims) for name in outputs}
-        found = {name: np.empty((*shape, *own[name]), variables[name].dtype) for name in outputs}
-        return found | {OUTCOME.name: np.empty(shape, np.int8)}
+        inner = {name: (self._multipliers,) * len(variables[name].dims) for name in outputs}
+        results = {name: np.empty((*shape, *inner[name]), variables[name].dtype) for name in outputs}
+        return results | {OUTCOME.name: np.empty(shape, np.int8)}
 
     def on_grid(
         self,
@@ -128,29 +128,29 @@ class StabilityAtlas:
         """
         axes = [np.asarray(axis, float) for axis in axes]
         shape = tuple(len(axis) for axis in axes)
-        found = self._empty(shape, outputs) if out is None else dict(out)
+        results = self._empty(shape, outputs) if out is None else dict(out)
         if self.closed_form and _FAST.issuperset(outputs) and len(axes) > 1:
-            self._tile(found, axes, rows)
-            return found
+            self._tile(results, axes, rows)
+            return results
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
         for name, value in self.at(points, outputs).items():
-            found[name][...] = value.reshape(found[name].shape)
-        return found
+            results[name][...] = value.reshape(results[name].shape)
+        return results
 
-    def _tile(self, found: dict[str, np.ndarray], axes: list[np.ndarray], rows: int | None) -> None:
-        """Fill ``found`` in closed form; the axes may be in any order."""
+    def _tile(self, results: dict[str, np.ndarray], axes: list[np.ndarray], rows: int | None) -> None:
+        """Fill ``results`` in closed form; the axes may be in any order."""
         # Tiles are blocks of neighbours, so axes must rise in the coordinates of the atlas.
         orders = [np.argsort(c.forward(a), kind="stable") for c, a in zip(self.atlas.coordinates, axes, strict=True)]
         rising = [axis[order] for axis, order in zip(axes, orders, strict=True)]
         steps = [set(np.diff(order)) for order in orders]
-        if all(len(each) < 2 for each in steps):
-            turned = tuple(slice(None, None, -1 if each == {-1} else 1) for each in steps)
-            self._fill({name: values[turned] for name, values in found.items()}, rising, rows)
+        if all(len(step) < 2 for step in steps):
+            turned = tuple(slice(None, None, -1 if step == {-1} else 1) for step in steps)
+            self._fill({name: values[turned] for name, values in results.items()}, rising, rows)
             return
-        in_order = {name: values.copy() for name, values in found.items()}
+        in_order = {name: values.copy() for name, values in results.items()}
         self._fill(in_order, rising, rows)
         for name, values in in_order.items():
-            found[name][np.ix_(*orders)] = values
+            results[name][np.ix_(*orders)] = values
 
     @property
     def _multipliers(self) -> int:
@@ -172,11 +172,11 @@ class StabilityAtlas:
         """True if cells are decided by the closed form of four states with a reversor."""
         return self.form.exchanges_halves and self.form.log_determinant is not None
 
-    def _fill(self, found: dict[str, np.ndarray], axes: list[np.ndarray], rows: int | None) -> None:
-        """Fill ``found`` tile by tile, then compute cells again for which the closed form is not accurate enough."""
+    def _fill(self, results: dict[str, np.ndarray], axes: list[np.ndarray], rows: int | None) -> None:
+        """Fill ``results`` tile by tile, then compute cells again for which the closed form is not accurate enough."""
         names, undamped = self.atlas.parameters, self._may_be_undamped(np.ix_(*axes))
         # Mark the cells that no tile covers by the outcome alone: blanking all arrays takes a tenth of the time of a chart.
-        found[OUTCOME.name][...] = Outcome.LOST
+        results[OUTCOME.name][...] = Outcome.LOST
         coordinates = [c.forward(axis) for c, axis in zip(self.atlas.coordinates, axes, strict=True)]
 
         def kernel(dense: bool) -> Any:
@@ -185,12 +185,12 @@ class StabilityAtlas:
 
         cut = tiles(self.atlas, coordinates, (charts.ROWS, charts.COLUMNS), rows=rows, dense=not undamped)
         again = [
-            _store(found, tile, cells)
+            _store(results, tile, cells)
             for tile, cells in charts.evaluated_tiles(cut, axes, names, self.atlas.fixed, kernel, self.rtol)
         ]
-        self._repair(found, axes, np.concatenate([np.empty((0, len(axes)), int), *again]))
-        if (lost := found[OUTCOME.name] == Outcome.LOST).any():
-            for name, values in found.items():
+        self._repair(results, axes, np.concatenate([np.empty((0, len(axes)), int), *again]))
+        if (lost := results[OUTCOME.name] == Outcome.LOST).any():
+            for name, values in results.items():
                 values[lost] = _nothing(name, values)
 
     def _may_be_undamped(self, columns: Iterable[np.ndarray]) -> bool:
@@ -198,12 +198,12 @@ class StabilityAtlas:
         model = self.build({**self.atlas.fixed, **dict(zip(self.atlas.parameters, columns, strict=True))})
         return model.hamiltonian is not None and bool(np.any(model.hamiltonian()))
 
-    def _repair(self, found: dict[str, np.ndarray], axes: list[np.ndarray], cells: np.ndarray) -> None:
-        outputs = [name for name in found if name != OUTCOME.name]
+    def _repair(self, results: dict[str, np.ndarray], axes: list[np.ndarray], cells: np.ndarray) -> None:
+        outputs = [name for name in results if name != OUTCOME.name]
         for part in (cells[i : i + (1 << 18)] for i in range(0, len(cells), 1 << 18)):
             points = np.stack([axis[part[:, k]] for k, axis in enumerate(axes)], axis=-1)
             for name, value in self.by_eigenvalues(points, outputs).items():
-                found[name][tuple(part.T)] = value
+                results[name][tuple(part.T)] = value
 
     def _exact_results(
         self, number: int, points: np.ndarray, phi: np.ndarray, outputs: tuple[str, ...]
@@ -213,8 +213,8 @@ class StabilityAtlas:
         values = {name: columns[:, k] for k, name in enumerate(self.atlas.parameters)}
         kernel = _point_kernel(self.build, outputs, self.rtol, self.closed_form)
         with _JUDGING:
-            found = kernel(phi, self.atlas.panels[number].value_error, values, self.atlas.fixed)
-        return {name: np.moveaxis(np.asarray(value), -1, 0) for name, value in found.items()}
+            results = kernel(phi, self.atlas.panels[number].value_error, values, self.atlas.fixed)
+        return {name: np.moveaxis(np.asarray(value), -1, 0) for name, value in results.items()}
 
 
 def _nothing(name: str, values: np.ndarray) -> float | int:
@@ -222,17 +222,17 @@ def _nothing(name: str, values: np.ndarray) -> float | int:
     return Outcome.LOST if name == OUTCOME.name else charts.UNDECIDED if values.dtype == np.int8 else np.nan
 
 
-def _store(found: Mapping[str, np.ndarray], tile: Tile, cells: charts.Cells) -> np.ndarray:
+def _store(results: Mapping[str, np.ndarray], tile: Tile, cells: charts.Cells) -> np.ndarray:
     """Store the results of a tile; returns the cells to compute again, as positions along each axis ``(N, d)``."""
     place = tuple(slice(i[0], i[-1] + 1) for i in tile.index)
-    for name, values in found.items():
+    for name, values in results.items():
         part = values[place]
         part[...] = cells[name].reshape(part.shape)
-    own = cells["unsure"].ndim
-    unsure = np.argwhere(cells["unsure"]) if cells["unsure"].any() else np.empty((0, own), int)
+    dims = cells["unsure"].ndim
+    unsure = np.argwhere(cells["unsure"]) if cells["unsure"].any() else np.empty((0, dims), int)
     first = [i[0] for i in tile.index]
-    leading = np.broadcast_to(np.array(first[:-own], int), (len(unsure), len(first) - own))
-    return np.concatenate([leading, unsure + first[-own:]], axis=1)
+    leading = np.broadcast_to(np.array(first[:-dims], int), (len(unsure), len(first) - dims))
+    return np.concatenate([leading, unsure + first[-dims:]], axis=1)
 
 
 @lru_cache(maxsize=16)
@@ -243,20 +243,20 @@ def _point_kernel(build: Build, outputs: tuple[str, ...], rtol: float, closed_fo
         model = build({**fixed, **values})
         if not (closed_form and _FAST & set(outputs)):
             return _by_eigenvalues(phi, model, error, outputs, rtol)
-        found = _by_eigenvalues(phi, model, error, tuple({*outputs, *DEFAULT_OUTPUTS}), rtol)
-        found |= _sharper(phi, model, error, found)
-        return {name: found[name] for name in (*outputs, "outcome")}
+        results = _by_eigenvalues(phi, model, error, tuple({*outputs, *DEFAULT_OUTPUTS}), rtol)
+        results |= _sharper(phi, model, error, results)
+        return {name: results[name] for name in (*outputs, "outcome")}
 
     return jax.jit(kernel, compiler_options=compiler_options(march=True))
 
 
-def _sharper(phi: Array, model: FloquetModel, error_of_phi: Array, found: dict[str, Array]) -> dict[str, Array]:
+def _sharper(phi: Array, model: FloquetModel, error_of_phi: Array, results: dict[str, Array]) -> dict[str, Array]:
     """Results with more verdicts, and with the exact results of Hamiltonian lanes.
 
     Where the interval of rho contains 1, there is a verdict if no multiplier can cross the unit circle (Schur-Cohn).
     """
     parts, log_d = quartic.blocks(phi), jnp.broadcast_to(model.reduced.log_determinant(), phi.shape[1:])  # pyright: ignore[reportOptionalCall]
-    rho, error, verdict = (found[name] for name in DEFAULT_OUTPUTS)
+    rho, error, verdict = (results[name] for name in DEFAULT_OUTPUTS)
     settled = quartic.nothing_crosses(quartic.coefficients(parts, log_d, error_of_phi), log_d)
     verdict = jnp.where((verdict == charts.UNDECIDED) & settled, jnp.where(rho < 1, 0, 1), verdict).astype(jnp.int8)
     if model.hamiltonian is not None:

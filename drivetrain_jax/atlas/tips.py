@@ -44,14 +44,14 @@ def undamped_tips(criteria: Criteria, horizontal: int, resonances: Resonances) -
         return []
     values = np.asarray(resonances.values({**dict.fromkeys(atlas.parameters, np.nan), **atlas.fixed}))
     patches, end = patches_of(criteria), float(atlas.to_coordinates(atlas.upper)[v])
-    found, exactly = [], dict.fromkeys(atlas.parameters, 0.0)
+    tips, exactly = [], dict.fromkeys(atlas.parameters, 0.0)
     for label, kind, speed in zip(resonances.labels, resonances.multipliers, values, strict=True):
         point = atlas.lower.copy()
         point[h] = speed
         inside = atlas.lower[h] <= speed <= atlas.upper[h]
         if inside and _grows([patches[k] for k in _EDGES[kind]], atlas.to_coordinates(point), end, h):
-            found.append(Tip(label, kind, dict(zip(atlas.parameters, map(float, point), strict=True)), exactly, True))
-    return found
+            tips.append(Tip(label, kind, dict(zip(atlas.parameters, map(float, point), strict=True)), exactly, True))
+    return tips
 
 
 def _grows(functions: Sequence[Patches], start: np.ndarray, end: float, h: int) -> bool:
@@ -61,7 +61,7 @@ def _grows(functions: Sequence[Patches], start: np.ndarray, end: float, h: int) 
     """
     edges = len(functions) > 1
     followed = functions if edges else [functions[0].derivative(h)]
-    slopes = [each.derivative(h) for each in followed]
+    slopes = [f.derivative(h) for f in followed]
     x = np.tile(start, (len(functions), 1))
     # The other coordinate rises quadratically.
     for fraction in (np.arange(1, _STEPS + 1) / _STEPS) ** 2:
@@ -155,11 +155,11 @@ def find_tips(atlas: Atlas, system: type[System], *, opening: bool = True) -> Ti
     for kind, patch, search in zip(criteria.multipliers, patches, searches, strict=True):
         x, rates = polish(criteria, search.points, kind, horizontal)
         opens = (search.curvature * search.slope < 0) == (rises(criteria, 1 - horizontal) > 0)
-        found = _describe(criteria, kind, horizontal, (x, rates, _named_at(criteria, patch, x, horizontal)), opens)
+        certain = _describe(criteria, kind, horizontal, (x, rates, _named_at(criteria, patch, x, horizontal)), opens)
         x, rates = suspected(criteria, kind, horizontal, search.undecided, x)
         opens = rates.gradient[:, 1 - horizontal] * rises(criteria, 1 - horizontal) > 0
         likely = _describe(criteria, kind, horizontal, (x, rates, _named_at(criteria, patch, x, horizontal)), opens)
-        tips += [*found, *(replace(tip, proved=False) for tip in likely)]
+        tips += [*certain, *(replace(tip, proved=False) for tip in likely)]
     undecided = tuple(_box(atlas, box) for search in searches for box in search.undecided)
     undecided += tuple(_box(atlas, np.stack([gap.lower, gap.upper])) for gap in atlas.gaps)
     chosen = tuple(tip for tip in tips if tip.opens or not opening)
@@ -211,13 +211,13 @@ def _describe(criteria: Criteria, kind: str, h: int, points: tuple, opens: np.nd
     atlas, system = criteria.atlas, criteria.system
     bounding = limiting(criteria, x, rates)
     errors = _errors(rates, h)
-    found = []
+    tips = []
     for i in range(len(x)):
         if not bounding[i]:
             continue
         point, slope = parameters_at(atlas, x[i]), [c.slope for c in atlas.coordinates]
         scale = np.array([abs(float(slope[k](point[k]))) for k in range(2)])
-        found.append(
+        tips.append(
             Tip(
                 _name(atlas, system, kind, compared[i]),
                 kind,
@@ -226,7 +226,7 @@ def _describe(criteria: Criteria, kind: str, h: int, points: tuple, opens: np.nd
                 bool(opens[i]),
             )
         )
-    return found
+    return tips
 
 
 def _errors(rates: Growth, h: int) -> np.ndarray:

@@ -88,9 +88,9 @@ def stability_along(atlas: Atlas, system: type[System]) -> Line:
     criteria = Criteria.of(part, system)
     changes, undecided = [], [_values(part, np.stack([gap.lower, gap.upper])[:, 0], 0) for gap in part.gaps]
     for kind, patches in zip(criteria.multipliers, patches_of(criteria), strict=True):
-        found = roots(patches)
-        changes += _crossings(part, found.x[:, None], found.error, 0, kind)
-        undecided += [_values(part, ends, 0) for ends in found.undecided]
+        zeros = roots(patches)
+        changes += _crossings(part, zeros.x[:, None], zeros.error, 0, kind)
+        undecided += [_values(part, ends, 0) for ends in zeros.undecided]
     if lower < part.lower[0]:
         # Both signs of the parameter have the same results.
         changes += [

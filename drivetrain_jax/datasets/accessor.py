@@ -90,10 +90,10 @@ class DrivetrainAccessor:
         from drivetrain_jax.datasets.figure import resonances
 
         self._analysis()
-        found = resonances(self._dataset)
-        if found is None:
+        predicted = resonances(self._dataset)
+        if predicted is None:
             raise InputError("resonances: none are predicted along these axes; allowed is a chart that has some")
-        return found
+        return predicted
 
     def orders(self) -> xr.DataArray:
         """The speeds [rpm] at which orders of the excitation meet the natural frequencies, with a dimension ``order``.
@@ -116,13 +116,13 @@ class DrivetrainAccessor:
             raise InputError(
                 "orders: not known; allowed is a result with frequencies, of a planetary gear with its teeth"
             )
-        found = self._dataset[name]
+        frequency = self._dataset[name]
         order = xr.DataArray(list(orders.per_turn), dims="order", name="order", attrs={"long_name": "order"})
         attrs = {"units": "rpm", "long_name": f"speed of the {orders.shaft} at which the order meets the mode"}
-        dims = (*found.dims, "order")
+        dims = (*frequency.dims, "order")
         return xr.DataArray(
-            orders.speeds(in_hertz(found.values, found.attrs["units"])),
-            {**found.coords, "order": order},
+            orders.speeds(in_hertz(frequency.values, frequency.attrs["units"])),
+            {**frequency.coords, "order": order},
             dims,
             "order_speed",
             attrs,
@@ -256,14 +256,14 @@ def _columns(dataset: xr.Dataset) -> Iterator[tuple[str, np.ndarray]]:
     along = [c for c in dataset.coords.values() if c.ndim and set(c.dims) <= set(sweep)]
     for variable in (*along, *dataset.data_vars.values()):
         words = in_words(variable.variable) if "flag_meanings" in variable.attrs else variable.variable
-        own = [dim for dim in words.dims if dim not in sweep]
-        values = words.set_dims({dim: dataset.sizes[dim] for dim in (*sweep, *own)}).transpose(*sweep, *own).values
+        inner = [dim for dim in words.dims if dim not in sweep]
+        values = words.set_dims({dim: dataset.sizes[dim] for dim in (*sweep, *inner)}).transpose(*sweep, *inner).values
         name = scene_key(variable) if variable.name in dataset.coords else str(variable.name)
         units = f" [{u}]" if (u := str(variable.attrs.get("units", "1"))) not in ("1", "") else ""
         for entry in np.ndindex(values.shape[len(sweep) :]):
             labels = [
                 str(dataset[dim].values[k]) if dim in dataset.coords else str(k + 1)
-                for dim, k in zip(own, entry, strict=True)
+                for dim, k in zip(inner, entry, strict=True)
             ]
             column, header = values[(..., *entry)], "_".join((name, *labels))
             if column.dtype.kind == "c":

@@ -156,28 +156,28 @@ def _in_atlas_parameters(atlas: StoredAtlas, grid: Any) -> tuple[Any, StoredAtla
         return grid, atlas.viewed({}, grid)
     counts = {name: value for name, value in grid.items() if _is_count(value)}
     rows = {name: value[:2] if _is_range(value) else value for name, value in grid.items() if name not in counts}
-    atlas, found = atlas.viewed(rows, counts), atlas.in_parameters(rows)
+    atlas, values = atlas.viewed(rows, counts), atlas.in_parameters(rows)
     parameters = {quantity.name: name for name, (quantity, _) in atlas.views.items()}
     for name, value in grid.items():
         parameter: Any = parameters.get(name, name)
         if name in counts:
-            found[parameter] = value
-        elif parameter in found and _is_range(value):
-            found[parameter] = (*found[parameter], value[2])
-    return found, atlas
+            values[parameter] = value
+        elif parameter in values and _is_range(value):
+            values[parameter] = (*values[parameter], value[2])
+    return values, atlas
 
 
-def _is_written(given: Any) -> bool:
-    ends = given if isinstance(given, (tuple, list)) else (given,)
+def _is_written(entry: Any) -> bool:
+    ends = entry if isinstance(entry, (tuple, list)) else (entry,)
     return any(isinstance(end, str) and _units.split(end) for end in ends)
 
 
-def _is_count(given: Any) -> bool:
-    return isinstance(given, (int, np.integer)) and not isinstance(given, bool)
+def _is_count(entry: Any) -> bool:
+    return isinstance(entry, (int, np.integer)) and not isinstance(entry, bool)
 
 
-def _is_range(given: Any) -> bool:
-    return isinstance(given, tuple) and len(given) == 3 and _is_count(given[2])
+def _is_range(entry: Any) -> bool:
+    return isinstance(entry, tuple) and len(entry) == 3 and _is_count(entry[2])
 
 
 def _grid_values(atlas: StoredAtlas, grid: Any) -> tuple[dict[str, np.ndarray], dict[str, float]]:
@@ -185,33 +185,33 @@ def _grid_values(atlas: StoredAtlas, grid: Any) -> tuple[dict[str, np.ndarray], 
 
     ``grid`` is that of :meth:`AtlasEntrypoint.open_dataset` with names of parameters; any other raises :class:`InputError`.
     """
-    given = dict.fromkeys(atlas.parameters, grid) if _is_count(grid) else {} if grid is None else grid
-    if not isinstance(given, Mapping):
+    table = dict.fromkeys(atlas.parameters, grid) if _is_count(grid) else {} if grid is None else grid
+    if not isinstance(table, Mapping):
         raise InputError(f"grid = {shown(grid)}: allowed is a number of values, or a table by the names of parameters")
-    for name, value in given.items():
+    for name, value in table.items():
         if name not in atlas.parameters:
             atlas.refuse(str(name), value)
-    values = {name: _values(atlas, name, given.get(name, _DEFAULT)) for name in atlas.parameters}
+    values = {name: _values(atlas, name, table.get(name, _DEFAULT)) for name in atlas.parameters}
     axes = {name: value for name, value in values.items() if value.ndim}
     if not axes:
         raise InputError("grid: fixes all parameters; allowed is one that varies, and query answers for a point")
     return axes, {name: float(value) for name, value in values.items() if not value.ndim}
 
 
-def _values(atlas: StoredAtlas, name: str, given: Any) -> np.ndarray:
+def _values(atlas: StoredAtlas, name: str, entry: Any) -> np.ndarray:
     """The values of a parameter that varies, or the one that it has."""
     label = atlas.viewed_as(name)[0].name
-    start, stop, count = (*atlas.ranges[name], given) if _is_count(given) else given if _is_range(given) else (0, 0, 0)
-    if count < 2 and (_is_count(given) or _is_range(given)):
+    start, stop, count = (*atlas.ranges[name], entry) if _is_count(entry) else entry if _is_range(entry) else (0, 0, 0)
+    if count < 2 and (_is_count(entry) or _is_range(entry)):
         allowed = f"allowed is 2 or more; {float(count)} would fix {label}"
         raise InputError(f"grid.{label} = {count}: is a number of values; {allowed}")
     try:
-        values = np.linspace(float(start), float(stop), count) if count else np.asarray(given)
+        values = np.linspace(float(start), float(stop), count) if count else np.asarray(entry)
     # Words, and rows of different lengths.
     except (TypeError, ValueError):
         values = np.empty(0)
     if values.dtype.kind not in "iuf" or values.ndim > 1 or not values.size:
-        raise InputError(f"grid.{label} = {shown(given)}: allowed is {_ALLOWED}")
+        raise InputError(f"grid.{label} = {shown(entry)}: allowed is {_ALLOWED}")
     atlas.check_within(name, values)
     return values.astype(float)
 
@@ -304,13 +304,13 @@ class _Result(BackendArray):
             chosen = np.arange(size)[part]
             every.append(chosen.reshape(*chosen.shape, *(1,) * (spread if isinstance(part, slice) else behind)))
         every = np.broadcast_arrays(*every)
-        swept, own = every[: len(self.cells.axes)], every[len(self.cells.axes) :]
-        if not own:
+        swept, inner = every[: len(self.cells.axes)], every[len(self.cells.axes) :]
+        if not inner:
             return self.cells.points(swept, self.name)
         # The dimension of a slice comes last, those of arrays are shared by all axes.
         sliced = isinstance(key[-1], slice)
         values = self.cells.points([part[..., 0] for part in swept] if sliced else swept, self.name)
-        return values[..., key[-1]] if sliced else np.take_along_axis(values, own[0][..., None], -1)[..., 0]
+        return values[..., key[-1]] if sliced else np.take_along_axis(values, inner[0][..., None], -1)[..., 0]
 
     def _block(self, key: Key) -> np.ndarray:
         sizes = [np.arange(n)[k].size for k, n in zip(key, self.shape, strict=True) if not _is_count(k)]

@@ -119,10 +119,10 @@ def drawn(datasets: list[xr.Dataset], asked: list[str], check: bool = True) -> F
 
     ``check`` raises :class:`InputError` for a unit that measures nothing in the first dataset.
     """
-    datasets = [_with_resonances(in_physical_data(each, asked)) for each in datasets]
+    datasets = [_with_resonances(in_physical_data(dataset, asked)) for dataset in datasets]
     if check:
         check_measured(datasets[0], asked)
-    return view.plot(*(in_units(each, asked) for each in datasets))
+    return view.plot(*(in_units(dataset, asked) for dataset in datasets))
 
 
 def _dataset(source: Any) -> xr.Dataset:
@@ -178,11 +178,11 @@ def in_physical_data(dataset: xr.Dataset, asked: Sequence[str]) -> xr.Dataset:
         return dataset
     known = {n: e["value"] for n, e in json.loads(dataset.attrs.get("fixed_parameters", "{}")).items()} | data
     for name in pure:
-        found = physical.back(name, known) if physical else None
-        if found is None or all(size(found[0].units, unit) is None for unit in asked):
+        quantity = physical.back(name, known) if physical else None
+        if quantity is None or all(size(quantity[0].units, unit) is None for unit in asked):
             continue
         # Predictions along the parameter are computed again along the quantity.
-        dataset = in_physical_units(dataset.drop_vars([LABELS, f"{LABELS}_{name}"], errors="ignore"), name, *found)
+        dataset = in_physical_units(dataset.drop_vars([LABELS, f"{LABELS}_{name}"], errors="ignore"), name, *quantity)
     return dataset
 
 
@@ -191,8 +191,8 @@ def _with_resonances(dataset: xr.Dataset) -> xr.Dataset:
     analysis = declared.get(str(dataset.attrs.get("analysis")))
     if analysis is None or not analysis.predicted or LABELS in dataset.coords:
         return dataset
-    found = resonances(dataset)
-    return dataset if found is None else dataset.assign_coords({found.name: found})
+    predicted = resonances(dataset)
+    return dataset if predicted is None else dataset.assign_coords({predicted.name: predicted})
 
 
 def _loaded(dataset: xr.Dataset) -> xr.Dataset:
@@ -235,11 +235,11 @@ def resonances(dataset: xr.Dataset) -> xr.DataArray | None:
     values, quantity = predicted.values(known | mesh), dataset[dims[axis]]
     if quantity.name != axis:
         order = np.argsort(known[axis])
-        own, shown = known[axis][order], quantity.values[order]
+        parameter, shown = known[axis][order], quantity.values[order]
         # Quantity and parameter are proportional, or else known within the axis alone.
-        ratio = shown[-1] / own[-1]
-        proportional = np.allclose(shown, ratio * own, rtol=1e-12, atol=0)
-        values = values * ratio if proportional else np.interp(values, own, shown, left=np.nan, right=np.nan)
+        ratio = shown[-1] / parameter[-1]
+        proportional = np.allclose(shown, ratio * parameter, rtol=1e-12, atol=0)
+        values = values * ratio if proportional else np.interp(values, parameter, shown, left=np.nan, right=np.nan)
     coords = {dims[name]: dataset[dims[name]].variable for name in names}
     coords[LABELS] = xr.Variable(LABELS, list(predicted.labels), {"long_name": "resonance"})
     about = {"units": quantity.attrs["units"], "long_name": predicted.long_name}

@@ -139,9 +139,9 @@ def _fixed(system: type[System], shaft: GivenData | None, name: str, value: Any)
 def _units(system: type[System], shaft: GivenData | None) -> dict[str, Any]:
     """The units in which the page begins: those of physical data where the file knows these."""
     speed, inertia, stiffness = system.roles.get("speed"), None, None
-    for each in shaft.physical.conversions if shaft else ():
-        if shaft and each.parameter == speed and len(each.needs) == 3:
-            inertia, stiffness = (shaft.data.get(name) for name in each.needs[1:])
+    for rule in shaft.physical.conversions if shaft else ():
+        if shaft and rule.parameter == speed and len(rule.needs) == 3:
+            inertia, stiffness = (shaft.data.get(name) for name in rule.needs[1:])
     known = bool(inertia and stiffness)
     return {"angle": "deg" if shaft else "rad", "speed": "rpm" if known else "1", "J": inertia, "k": stiffness}
 
@@ -166,14 +166,14 @@ def _hamiltonian(atlas: Atlas, build: Callable[..., FloquetModel]) -> bool | lis
     points = _inside(atlas)
     if everywhere(points):
         return True
-    found = []
+    faces = []
     for k, ends in enumerate(zip(atlas.lower, atlas.upper, strict=True)):
         for value in {*ends, 0.0}:
             at = points.copy()
             at[:, k] = value
             if ends[0] <= value <= ends[1] and everywhere(at):
-                found.append((k, float(value)))
-    return found
+                faces.append((k, float(value)))
+    return faces
 
 
 def _time(build: Callable[..., FloquetModel], atlas: Atlas, system: type[System]) -> dict[str, Any] | None:

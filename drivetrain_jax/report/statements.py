@@ -99,19 +99,19 @@ def _main_axis(dataset: xr.Dataset, variable: xr.DataArray) -> xr.DataArray | No
 
 def _about_numbers(dataset: xr.Dataset, variable: xr.DataArray) -> Iterator[str]:
     """Smallest and largest value with their places; by label if the analysis adds a short dimension."""
-    own = [dim for dim in variable.dims if dim not in dataset["outcome"].dims]
-    if len(own) > 1 or (own and variable.sizes[own[0]] > MOST_RANGES):
+    inner = [dim for dim in variable.dims if dim not in dataset["outcome"].dims]
+    if len(inner) > 1 or (inner and variable.sizes[inner[0]] > MOST_RANGES):
         return
     if dataset["outcome"].size == 1:
         values = ", ".join(map(digits, np.atleast_1d(variable.values).ravel()))
         yield f"{_capital(variable.attrs.get('long_name', variable.name))}: {values}{_unit(variable)}."
         return
-    for k in range(variable.sizes[own[0]] if own else 1):
-        part = variable.isel({own[0]: k}) if own else variable
+    for k in range(variable.sizes[inner[0]] if inner else 1):
+        part = variable.isel({inner[0]: k}) if inner else variable
         if not np.isfinite(part.values).any():
             continue
         finite = np.ma.masked_invalid(part.values)
-        label = f", {str(own[0]).replace('_', ' ')} {_label(variable, own[0], k)}" if own else ""
+        label = f", {str(inner[0]).replace('_', ' ')} {_label(variable, inner[0], k)}" if inner else ""
         low, high = (np.unravel_index(int(f()), part.shape) for f in (finite.argmin, finite.argmax))
         name = _capital(str(variable.attrs.get("long_name", variable.name)))
         if part.values[low] == part.values[high]:
@@ -150,13 +150,13 @@ def _about_growth(dataset: xr.Dataset) -> Iterator[str]:
 def _about_limit(dataset: xr.Dataset, limit: Limit) -> Iterator[str]:
     """The largest forced amplitude and its place, compared with the limit; and the speeds within it."""
     for variable in amplitudes(dataset):
-        found = np.ma.masked_invalid(value_in(variable, limit.own))
-        if not found.count():
+        amplitude = np.ma.masked_invalid(value_in(variable, limit.own))
+        if not amplitude.count():
             continue
-        place = tuple(map(int, np.unravel_index(int(found.argmax()), found.shape)))
-        most = f"{limit.written(found[place])} at {_place(dataset, variable, place)}"
-        own = [dim for dim in variable.dims if dim not in dataset["outcome"].dims]
-        within = xr.DataArray(np.asarray(found.filled(np.inf)) <= limit.value, dims=variable.dims).all(own)
+        place = tuple(map(int, np.unravel_index(int(amplitude.argmax()), amplitude.shape)))
+        most = f"{limit.written(amplitude[place])} at {_place(dataset, variable, place)}"
+        inner = [dim for dim in variable.dims if dim not in dataset["outcome"].dims]
+        within = xr.DataArray(np.asarray(amplitude.filled(np.inf)) <= limit.value, dims=variable.dims).all(inner)
         name, allowed = _capital(variable.attrs.get("long_name", variable.name)), limit.written(limit.value)
         if bool(within.all()):
             yield f"{name}: at most {most}, within the limit of {allowed}."
@@ -166,14 +166,14 @@ def _about_limit(dataset: xr.Dataset, limit: Limit) -> Iterator[str]:
         kept = "nowhere" if not bool(within.any()) else f"at {_share(float(within.mean()))} of the points"
         kept = f"at {ranges_text(axis, inside.values)}" if axis is not None and bool(inside.any()) else kept
         # A point without a value is not within the limit.
-        side = "above" if found[place] > limit.value else "within"
+        side = "above" if amplitude[place] > limit.value else "within"
         yield f"{name}: up to {most}, {side} the limit of {allowed}; within it {kept}."
 
 
 def amplitudes(dataset: xr.Dataset) -> list[xr.DataArray]:
     """The forced amplitudes among the results."""
-    found = [dataset.get(name) for name in ("amplitude", "orbit_amplitude")]
-    return [v for v in found if v is not None and dataset.attrs.get("analysis") == "forced"]
+    variables = [dataset.get(name) for name in ("amplitude", "orbit_amplitude")]
+    return [v for v in variables if v is not None and dataset.attrs.get("analysis") == "forced"]
 
 
 def _about_outcome(dataset: xr.Dataset) -> Iterator[str]:
@@ -295,14 +295,14 @@ def value_text(variable: xr.DataArray, value: Any) -> str:
 
 def coordinates(dataset: xr.Dataset, variable: xr.DataArray, place: tuple[Any, ...]) -> list[tuple[str, str, str]]:
     """Name, value and unit of every coordinate at one place of ``variable``."""
-    found = []
+    rows = []
     for dim, k in zip(variable.dims, place, strict=True):
         columns = [c for c in dataset.coords.values() if c.dims == (dim,) and dim == "point" and c.name != "point"]
         for axis in columns or ([dataset[dim]] if dim in dataset.coords else []):
             words = axis.dtype.kind in "UO"
             name = scene_key(axis).replace("_", " ") if words else scene_key(axis)
-            found.append((name, str(axis.values[k]) if words else digits(axis.values[k]), units_of(axis)))
-    return found
+            rows.append((name, str(axis.values[k]) if words else digits(axis.values[k]), units_of(axis)))
+    return rows
 
 
 def flag_words(variable: xr.DataArray) -> dict[int, str]:

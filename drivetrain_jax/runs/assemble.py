@@ -131,8 +131,8 @@ def misfits(layout: Mapping[str, tuple[Any, tuple[int, ...]]], scene: Scene) -> 
     shape = Grid.of(scene).result_shape
 
     def fits(variable: Variable) -> bool:
-        kind, found = layout.get(variable.name, ("", ()))
-        return kind == variable.dtype and found[: len(shape)] == shape and len(found) == len(shape) + len(variable.dims)
+        kind, sizes = layout.get(variable.name, ("", ()))
+        return kind == variable.dtype and sizes[: len(shape)] == shape and len(sizes) == len(shape) + len(variable.dims)
 
     return [v.name for v in (() if scene.analysis.continuous else result_variables(scene)) if not fits(v)]
 
@@ -233,8 +233,8 @@ def result_attrs(scene: Scene) -> dict[str, str]:
         parameter = scene.system.parameter(name)
         fixed[name] = {"value": _finite(value), "units": parameter.units, "long_name": parameter.long_name}
     # An axis given in physical data takes the role of its parameter.
-    given = {axis.name: axis.dim for axis in scene.axes if axis.given}
-    roles = {role: given.get(name, name) for role, name in scene.system.roles.items()}
+    dim_of = {axis.name: axis.dim for axis in scene.axes if axis.given}
+    roles = {role: dim_of.get(name, name) for role, name in scene.system.roles.items()}
     installed, created, version = versions((*PACKAGES, *_STORAGE)), now(), drivetrain_jax.__version__
     cited = {"references": scene.system.source} if scene.system.source else {}
     return {
@@ -291,11 +291,11 @@ def stored_blocks(
     for block in job.blocks(points) if numbers else ():
         if first + block.number not in numbers or block.number in without:
             continue
-        found, count = store.read(first + block.number) or {}, len(job.points(block))
-        if {n: (str(x.dtype), x.ndim) for n, x in found.items()} == kinds and {len(x) for x in found.values()} == {
+        results, count = store.read(first + block.number) or {}, len(job.points(block))
+        if {n: (str(x.dtype), x.ndim) for n, x in results.items()} == kinds and {len(x) for x in results.values()} == {
             count
         }:
-            yield block, found
+            yield block, results
 
 
 @dataclass(frozen=True)
@@ -342,10 +342,10 @@ class ZarrBlocks:
 
     def read(self, number: int) -> Results | None:
         """The results of a shard."""
-        grid, found = self.job.grid, zarr_store.read(Path(self.place), self.job.boxes, number)
-        if found is None:
+        grid, shard = self.job.grid, zarr_store.read(Path(self.place), self.job.boxes, number)
+        if shard is None:
             return None
-        moved = {name: sweep_first(values, grid) for name, values in found.items()}
+        moved = {name: sweep_first(values, grid) for name, values in shard.items()}
         rows = {name: values.reshape(-1, *values.shape[len(grid.shape) :]) for name, values in moved.items()}
         return {name: values[:, None] if grid.path_is_fixed else values for name, values in rows.items()}
 

@@ -116,8 +116,8 @@ class AtlasQuery:
                 source = shaft.physical.source(name) if shaft and name not in given else ""
                 check_same(name, value, atlas.fixed[name], source)
         kept = {name for name in atlas.parameters if name not in free or name in within}
-        own = {name: atlas.ranges[name] for name in ranges}
-        own |= {name: _within(value, atlas.ranges[name]) for name, value in values.items() if name in kept}
+        kept_values = {name: atlas.ranges[name] for name in ranges}
+        kept_values |= {name: _within(value, atlas.ranges[name]) for name, value in values.items() if name in kept}
         backs = {name: shaft.back(name) for name in atlas.parameters if shaft and name not in given}
         seen = replace(atlas, views={name: back for name, back in backs.items() if back})
         for name in values:
@@ -125,9 +125,9 @@ class AtlasQuery:
                 physical = atlas.scene.system.physical
                 seen.refuse(name, values[name], *atlas.fixed, *(physical.names if physical else ()))
         for name in atlas.parameters:
-            if name not in free or name in own:
-                _check_range(seen, name, own.get(name), name in (*ranges, *within))
-        return cls(atlas, own, shaft)
+            if name not in free or name in kept_values:
+                _check_range(seen, name, kept_values.get(name), name in (*ranges, *within))
+        return cls(atlas, kept_values, shaft)
 
     def direct(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """Spectral radii by direct solves; the points whose verdict is proved are counted."""
@@ -182,19 +182,19 @@ class AtlasQuery:
 
     def physical(self, values: Mapping[str, float | Range]) -> dict[str, Any]:
         """``values`` in the physical units of the input; empty without physical input."""
-        found = {}
+        physical = {}
         if self.shaft is None:
-            return found
+            return physical
         for name, value in values.items():
             ends = [self.shaft.quantity(name, end) for end in (value if isinstance(value, tuple) else (value,))]
             known = [end for end in ends if end is not None]
             if known:
                 numbers = [number for _, number, _ in known]
-                found[known[0][0]] = {
+                physical[known[0][0]] = {
                     "value": numbers if isinstance(value, tuple) else numbers[0],
                     "units": known[0][2],
                 }
-        return found
+        return physical
 
 
 def _unit(units: str) -> str:
@@ -208,7 +208,7 @@ def _plain(value: Any) -> Any:
 def _within(value: Any, ends: Range) -> Any:
     """``value`` (or both ends of a range), moved to an end of the atlas if it is that close."""
     if isinstance(value, tuple):
-        return tuple(_within(each, ends) for each in value)
+        return tuple(_within(number, ends) for number in value)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return value
     return next((end for end in ends if math.isclose(value, end, rel_tol=_SAME)), value)
@@ -227,9 +227,9 @@ def _check_range(atlas: StoredAtlas, name: str, value: Any, wanted: bool) -> Non
     if isinstance(value, tuple) != wanted:
         needed = "a range is needed" if wanted else "is a range"
         raise InputError(f"{label} = {shown}: {needed}; {allowed}")
-    for end, each in zip(ends, numbers, strict=True):
+    for end, number in zip(ends, numbers, strict=True):
         if isinstance(end, bool) or not isinstance(end, (int, float)) or not low <= end <= high:
-            raise InputError(f"{label} = {as_given(each)}: {allowed}")
+            raise InputError(f"{label} = {as_given(number)}: {allowed}")
     if wanted and not value[0] < value[1]:
         raise InputError(f"{label} = {shown}: allowed is a rising range")
 
@@ -257,7 +257,7 @@ def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None)
     lines = [f"{system.name} atlas, {asked.heading()}", *rows, *growth_lines(grows, sign=""), *gradient_lines(effects)]
     lines += ["nearest change of stability"] if nearest or not panels.panels else []
     lines += [] if panels.panels else [f"  unknown: the atlas has no panel ({panels.gaps[0].reason})"]
-    lines += [line for each in nearest for line in _nearest_lines(asked, each)]
+    lines += [line for change in nearest for line in _nearest_lines(asked, change)]
     compared, forced = forced_at(atlas, amplitude, point, results.get("verdict"))
     lines += compared
     data = {
@@ -270,14 +270,14 @@ def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None)
         "proved": proved,
         **({"growth": grows} if grows else {}),
         "gradient": slopes,
-        "sensitivities": [each._asdict() for each in effects or ()],
+        "sensitivities": [change._asdict() for change in effects or ()],
         "nearest": {
-            each.parameter: {
-                "below": _crossing(asked, each.parameter, each.below),
-                "above": _crossing(asked, each.parameter, each.above),
-                "undecided": [list(r) for r in each.undecided],
+            change.parameter: {
+                "below": _crossing(asked, change.parameter, change.below),
+                "above": _crossing(asked, change.parameter, change.above),
+                "undecided": [list(r) for r in change.undecided],
             }
-            for each in nearest
+            for change in nearest
         },
     }
     return Reply(lines, data, _point_sentence(asked, data["meanings"].get("verdict"), grows, nearest))
@@ -291,13 +291,13 @@ def _point_sentence(
         return ""
     words = verdict_words(verdict, grows)
     speed = asked.atlas.scene.system.roles.get("speed")
-    changes = [(each, c) for each in nearest for c in (each.below, each.above) if c]
-    along = [(each, c) for each, c in changes if each.parameter == speed] or [
+    changes = [(change, c) for change in nearest for c in (change.below, change.above) if c]
+    along = [(change, c) for change, c in changes if change.parameter == speed] or [
         x for x in changes if x[0] is changes[0][0]
     ]
     if along:
-        each, crossing = min(along, key=lambda x: abs(x[1].value - x[0].value))
-        words.append(f"the nearest change of stability lies {_side(asked, each.parameter, each.value, crossing)}")
+        change, crossing = min(along, key=lambda x: abs(x[1].value - x[0].value))
+        words.append(f"the nearest change of stability lies {_side(asked, change.parameter, change.value, crossing)}")
     return f"{'; '.join(words)}."
 
 
@@ -376,11 +376,11 @@ def speed_windows(
     asked = replace(AtlasQuery.of(atlas, given, ranges=(), free=(speed,), within=(speed,)), show=show)
     panels = atlas.stability.atlas
     part = narrow(panels, {speed: asked.values[speed]}) if speed in asked.values else panels
-    found = design.speed_windows(part, atlas.scene.system, asked.numbers(), margin=margin, direct=asked.direct)
-    names = [_resonance(asked, speed, each) for each in found.unstable]
-    compared, forced = forced_over(atlas, amplitude, [w.safe for w in found.windows], asked.numbers(), asked.named)
+    answer = design.speed_windows(part, atlas.scene.system, asked.numbers(), margin=margin, direct=asked.direct)
+    names = [_resonance(asked, speed, interval) for interval in answer.unstable]
+    compared, forced = forced_over(atlas, amplitude, [w.safe for w in answer.windows], asked.numbers(), asked.named)
     lines, sensitivities = [f"safe speeds, {asked.heading()}, margin {margin:g}"], []
-    for k, w in enumerate(found.windows):
+    for k, w in enumerate(answer.windows):
         ends = " to ".join(
             asked.named(speed, value) + BEYOND[_kind(asked, speed, *end)]
             for value, end in zip(w.safe, w.interval.ends, strict=True)
@@ -408,36 +408,38 @@ def speed_windows(
                 "where": w.where,
                 "check": _check(w.check),
             }
-            for w, effects in zip(found.windows, sensitivities, strict=True)
+            for w, effects in zip(answer.windows, sensitivities, strict=True)
         ],
         "unstable": [
             {"range": [i.lower, i.upper], "physical": asked.physical({speed: (i.lower, i.upper)}), "resonance": word}
-            for i, word in zip(found.unstable, names, strict=True)
+            for i, word in zip(answer.unstable, names, strict=True)
         ],
-        "undecided": [list(r) for r in found.undecided],
+        "undecided": [list(r) for r in answer.undecided],
         **forced,
     }
-    lines += [] if found.windows else [f"  none {_OPEN if found.undecided else 'within the atlas'}"]
-    lines += [*_undecided(asked, speed, found.undecided), *asked.proofs()]
-    return Reply(lines, data, _where_unstable(asked, part, speed, found, names))
+    lines += [] if answer.windows else [f"  none {_OPEN if answer.undecided else 'within the atlas'}"]
+    lines += [*_undecided(asked, speed, answer.undecided), *asked.proofs()]
+    return Reply(lines, data, _where_unstable(asked, part, speed, answer, names))
 
 
 def _where_unstable(
-    asked: AtlasQuery, part: Atlas, speed: str, found: design.Windows, names: Sequence[str | None]
+    asked: AtlasQuery, part: Atlas, speed: str, answer: design.Windows, names: Sequence[str | None]
 ) -> str:
     """The unstable ranges with the ``names`` of their resonances, and the damping that removes them, in one sentence."""
     k = part.parameters.index(speed)
     ends = float(part.lower[k]), float(part.upper[k])
-    if not found.unstable:
+    if not answer.unstable:
         # Without a stable range nothing is decided.
-        word = "Stable" if found.windows else "Undecided"
-        return f"{word} at {asked.span(speed, ends)}{_but_undecided(found.undecided if found.windows else ())}."
+        word = "Stable" if answer.windows else "Undecided"
+        return f"{word} at {asked.span(speed, ends)}{_but_undecided(answer.undecided if answer.windows else ())}."
     label = asked.shown(speed, ends[0])[0]
     ranges = [
         asked.span(speed, (i.lower, i.upper)).removeprefix(f"{label} = ") + (f" ({word})" if word else "")
-        for i, word in zip(found.unstable, names, strict=True)
+        for i, word in zip(answer.unstable, names, strict=True)
     ]
-    return f"Unstable at {label} = {_and(ranges)}{_removed(asked, part, speed, ends)}{_but_undecided(found.undecided)}."
+    return (
+        f"Unstable at {label} = {_and(ranges)}{_removed(asked, part, speed, ends)}{_but_undecided(answer.undecided)}."
+    )
 
 
 def _removed(asked: AtlasQuery, part: Atlas, speed: str, speeds: Range) -> str:
@@ -485,11 +487,11 @@ def _but_undecided(ranges: Sequence[Range]) -> str:
 
 def _undecided(asked: AtlasQuery, name: str, ranges: Iterable[Range]) -> list[str]:
     """Undecided ranges as text, with what to do."""
-    found = [f"  undecided: {asked.span(name, ends)}" for ends in ranges]
+    lines = [f"  undecided: {asked.span(name, ends)}" for ends in ranges]
     remedy = (
         "  undecided ranges: `drivetrain point` solves a value there directly; a smaller rtol of the atlas narrows them"
     )
-    return [*found, remedy] if found else []
+    return [*lines, remedy] if lines else []
 
 
 def _kind(asked: AtlasQuery, name: str, end: float, crossing: Crossing | None) -> str:
@@ -543,9 +545,9 @@ def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: des
         lines += [] if answer.certain else ["  not certain: undecided ranges are wider than the errors"]
         lines.append(f"  {_checked(answer.check)}")
     lines += [*_undecided(asked, name, answer.undecided), *asked.proofs()]
-    found = [] if answer.value is None else [asked.values[asked.atlas.scene.system.roles["speed"]]]
+    speeds = [] if answer.value is None else [asked.values[asked.atlas.scene.system.roles["speed"]]]
     compared, forced = forced_over(
-        asked.atlas, amplitude, found, {**asked.numbers(), name: answer.value or 0.0}, asked.named
+        asked.atlas, amplitude, speeds, {**asked.numbers(), name: answer.value or 0.0}, asked.named
     )
     lines += [f"  {text}" for each in compared for text in each]
     data = {
@@ -589,7 +591,7 @@ def _elsewhere(safe: str, asked: AtlasQuery, answer: design.Answer) -> list[str]
     unstable = any(i.lower <= end <= i.upper for i in answer.intervals)
     lines = [f"  {'unstable' if unstable else 'undecided'} at {asked.named(name, end)}, the {safe} of the atlas"]
     for interval in answer.stable:
-        lower, upper = (_bounded(asked, name, *each) for each in interval.ends)
+        lower, upper = (_bounded(asked, name, *bounds) for bounds in interval.ends)
         lines.append(f"  stable from {lower} to {upper}")
     return lines
 

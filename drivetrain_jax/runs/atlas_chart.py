@@ -113,13 +113,13 @@ def with_boundaries(dataset: xr.Dataset, source: str | Path | xr.Dataset) -> xr.
 
 def in_physical_units(dataset: xr.Dataset, name: str, quantity: Parameter, convert: Convert) -> xr.Dataset:
     """``dataset`` with the parameter ``name``, its boundaries and its tips also, or instead, as physical data."""
-    other, own = quantity.name, dataset[name]
+    other, parameter = quantity.name, dataset[name]
     dataset = _curves_in_physical_units(dataset, name, other, quantity.units, convert)
     about = {"units": quantity.units, "long_name": quantity.long_name}
-    dataset = dataset.assign_coords({other: (own.dims, convert(own.values), about)})
+    dataset = dataset.assign_coords({other: (parameter.dims, convert(parameter.values), about)})
     roles = {role: other if p == name else p for role, p in json.loads(dataset.attrs["roles"]).items()}
     dataset = dataset.assign_attrs(roles=json.dumps(roles))
-    return dataset.swap_dims({name: other}) if own.ndim else dataset
+    return dataset.swap_dims({name: other}) if parameter.ndim else dataset
 
 
 def _curves_in_physical_units(dataset: xr.Dataset, name: str, other: str, units: str, convert: Convert) -> xr.Dataset:
@@ -187,12 +187,12 @@ def _curves(
         # Tongues open at their tips with increasing angle, and close there with increasing damping.
         tips = find_tips(narrow(whole, ranges), system, opening=system.roles.get("angle") in ranges)
     parts = [narrow(whole.slice(dict(zip(slices, point, strict=True))), ranges) for point in product(*slices.values())]
-    found = [_boundary(part, system, ranges, tips.searches if tips else ()) for part in parts]
-    shape = (*map(len, slices.values()), max(curve[name].size for curve in found for name in ranges))
+    curves = [_boundary(part, system, ranges, tips.searches if tips else ()) for part in parts]
+    shape = (*map(len, slices.values()), max(curve[name].size for curve in curves for name in ranges))
     coordinates: dict[str, tuple] = {}
     for name in ranges:
         padded = np.full(shape, np.nan)
-        for place, curve in zip(np.ndindex(shape[:-1]), found, strict=True):
+        for place, curve in zip(np.ndindex(shape[:-1]), curves, strict=True):
             padded[place][: curve[name].size] = curve[name]
         about = {"units": system.parameter(name).units, "long_name": f"boundary of stability, {name}"}
         coordinates[f"boundary_{name}"] = ((*slices, "boundary"), padded, about)
@@ -227,33 +227,35 @@ def _within(places: Mapping[str, np.ndarray], ranges: Mapping[str, tuple[float, 
     return {name: np.where(inside, values, np.nan) for name, values in places.items()}
 
 
-def _on_all_sides(found: Tips, signs: list[dict[str, float]], ranges: Mapping[str, tuple[float, float]]) -> Tips:
+def _on_all_sides(
+    tips_of_one_side: Tips, signs: list[dict[str, float]], ranges: Mapping[str, tuple[float, float]]
+) -> Tips:
     tips, boxes = [], []
     for side in signs:
-        for tip in found.tips:
+        for tip in tips_of_one_side.tips:
             point = {name: sign * tip.point[name] for name, sign in side.items()}
             # At 0 both signs are the same point.
             known = any(point == other.point for other in tips)
             if not known and all(low <= point[name] <= high for name, (low, high) in ranges.items()):
                 # A tongue that opens upwards at positive values opens downwards at negative ones.
                 tips.append(replace(tip, point=point, opens=tip.opens == (min(side.values()) > 0)))
-        for box in found.undecided:
+        for box in tips_of_one_side.undecided:
             boxes.append({name: tuple(sorted(sign * end for end in box[name])) for name, sign in side.items()})
-    return replace(found, tips=tuple(tips), undecided=tuple(boxes))
+    return replace(tips_of_one_side, tips=tuple(tips), undecided=tuple(boxes))
 
 
 def _tips(
-    found: Tips, system: type[System], names: Iterable[str]
+    tips: Tips, system: type[System], names: Iterable[str]
 ) -> dict[str, tuple[str | tuple[str, str], np.ndarray, dict[str, str]]]:
     """The tips as coordinates: names, opening, proof, position and error; and the undecided boxes."""
-    labels = np.array([tip.name for tip in found.tips], dtype=str)
-    proved = np.array([tip.proved for tip in found.tips], np.int8)
+    labels = np.array([tip.name for tip in tips.tips], dtype=str)
+    proved = np.array([tip.proved for tip in tips.tips], np.int8)
     meaning = {
         "units": "1",
         "long_name": "whether there is exactly one tip here within the bounds of the atlas (1) or not (0)",
     }
     other = next(name for name in names if name != system.resonances.axis)  # pyright: ignore[reportOptionalMemberAccess]
-    opens = np.array([tip.opens for tip in found.tips], np.int8)
+    opens = np.array([tip.opens for tip in tips.tips], np.int8)
     direction = {"units": "1", "long_name": f"whether the tongue opens (1) or closes (0) at its tip as {other} rises"}
     coordinates: dict[str, tuple] = {
         "tip": ("tip", labels, {"units": "1", "long_name": "resonance that the tongue grows from"}),
@@ -262,12 +264,12 @@ def _tips(
     }
     for name in names:
         units = {"units": system.parameter(name).units}
-        values = np.array([tip.point[name] for tip in found.tips])
-        errors = np.array([tip.error[name] for tip in found.tips])
+        values = np.array([tip.point[name] for tip in tips.tips])
+        errors = np.array([tip.error[name] for tip in tips.tips])
         coordinates[f"tip_{name}"] = ("tip", values, {**units, "long_name": f"tip of a tongue, {name}"})
         coordinates[f"tip_{name}_error"] = ("tip", errors, {**units, "long_name": f"bound of the error of tip_{name}"})
-        if found.undecided:
-            boxes = np.array([box[name] for box in found.undecided])
+        if tips.undecided:
+            boxes = np.array([box[name] for box in tips.undecided])
             about = {**units, "long_name": f"lower and upper {name} of a box that may hide further tips"}
             coordinates[f"undecided_{name}"] = (("undecided_box", "end"), boxes, about)
     return coordinates

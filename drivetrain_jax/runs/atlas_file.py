@@ -51,8 +51,8 @@ def check_same(name: str, value: Any, fixed: float, source: str = "") -> None:
     """
     if isinstance(value, tuple) or not np.allclose(value, fixed, rtol=SAME_FIXED, atol=0):
         made = f"the atlas is made for {name} = {fixed:.10g}"
-        given = f"{name} = {as_given(value)}" + (f" (from {source})" if source else "")
-        raise InputError(f"{given}: {made}; allowed is that value")
+        written = f"{name} = {as_given(value)}" + (f" (from {source})" if source else "")
+        raise InputError(f"{written}: {made}; allowed is that value")
 
 
 def as_given(value: Any) -> str:
@@ -61,21 +61,21 @@ def as_given(value: Any) -> str:
     return ":".join(f"{end:.10g}" if isinstance(end, (int, float)) else shown(end) for end in ends)
 
 
-def broadcast(given: Mapping[str, Any]) -> tuple[xr.DataArray, ...]:
+def broadcast(values: Mapping[str, Any]) -> tuple[xr.DataArray, ...]:
     """Arrays of one shape: unlabelled ones are broadcast by position, then all by dimension names."""
     import xarray as xr
 
-    plain = {name: np.asarray(v, float) for name, v in given.items() if not isinstance(v, xr.DataArray)}
+    plain = {name: np.asarray(v, float) for name, v in values.items() if not isinstance(v, xr.DataArray)}
     try:
         plain = dict(zip(plain, np.broadcast_arrays(*plain.values()), strict=True))
         labelled: dict[str, Any] = {
             n: xr.DataArray(v, dims=("point",) if v.ndim == 1 else None) for n, v in plain.items()
         }
-        arrays = [labelled.get(name, value) for name, value in given.items()]
+        arrays = [labelled.get(name, value) for name, value in values.items()]
         # The default of `broadcast` is the union of labels, with NaN for missing ones.
         return xr.broadcast(*xr.align(*arrays, join="exact", copy=False))
     except ValueError:
-        shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in given.items())
+        shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in values.items())
         allowed = "arrays that broadcast against each other, of the same labels along a dimension that they share"
         raise InputError(f"shapes {shapes}: allowed are {allowed}") from None
 
@@ -322,20 +322,20 @@ class StoredAtlas:
         whole = columns[self.parameters[0]]
         shape, dims = whole.shape, whole.dims
         flat = {name: np.asarray(column.values, float).reshape(-1) for name, column in columns.items()}
-        found = to_dataset(self.scene_on(flat, zipped=True), self.arrays(flat, zipped=True), {})
-        own = {name: v.dims[1:] for name, v in found.data_vars.items()}
+        dataset = to_dataset(self.scene_on(flat, zipped=True), self.arrays(flat, zipped=True), {})
+        inner = {name: v.dims[1:] for name, v in dataset.data_vars.items()}
         data = {
-            name: ((*dims, *own[name]), v.values.reshape((*shape, *v.shape[1:])), v.attrs)
-            for name, v in found.data_vars.items()
+            name: ((*dims, *inner[name]), v.values.reshape((*shape, *v.shape[1:])), v.attrs)
+            for name, v in dataset.data_vars.items()
         }
-        if "verdict" in found:
-            verdict = np.asarray(found["verdict"].values)
+        if "verdict" in dataset:
+            verdict = np.asarray(dataset["verdict"].values)
             data["proved"] = (dims, self.proved(flat, verdict).reshape(shape), PROVED)
         labels = {dim: whole.coords[dim] for dim in dims if dim in whole.coords}
         for name, value in checked.items():
             column = value if isinstance(value, xr.DataArray) else columns[name]
             labels |= self.coordinates(name, column.values, column.dims)
-        return xr.Dataset(data, labels, found.attrs)
+        return xr.Dataset(data, labels, dataset.attrs)
 
     def grid(self, *, proved: bool = False, **given: Any) -> xr.Dataset:
         """Results on the outer product of arrays, as of a scene with these axes; a number fixes its parameter.
@@ -357,11 +357,11 @@ class StoredAtlas:
             return self(**given)
         fixed = {name: float(column) for name, column in columns.items() if not column.ndim}
         part = self.slice(fixed)
-        found = to_dataset(part.scene_on(axes), part.arrays(axes), {})
-        if proved and "verdict" in found:
-            flags = self.proved(_meshed(axes, fixed), np.asarray(found["verdict"].values))
-            found["proved"] = (found["verdict"].dims, flags, PROVED)
-        return self.with_fixed(found, fixed)
+        dataset = to_dataset(part.scene_on(axes), part.arrays(axes), {})
+        if proved and "verdict" in dataset:
+            flags = self.proved(_meshed(axes, fixed), np.asarray(dataset["verdict"].values))
+            dataset["proved"] = (dataset["verdict"].dims, flags, PROVED)
+        return self.with_fixed(dataset, fixed)
 
     def proof(self, axes: Mapping[str, np.ndarray], fixed: Mapping[str, float], verdict: np.ndarray) -> str:
         """The number of proved verdicts of a chart, as a part of a sentence; of a large chart some cells are tested."""
@@ -421,9 +421,9 @@ class StoredAtlas:
 
     def proved(self, columns: Mapping[str, Any], verdict: np.ndarray) -> np.ndarray:
         """Flags, in the shape of ``verdict``, of the verdicts that are proved; ``columns`` are broadcast to this shape."""
-        given = [np.broadcast_to(np.asarray(columns[name], float), np.shape(verdict)) for name in self.parameters]
+        full = [np.broadcast_to(np.asarray(columns[name], float), np.shape(verdict)) for name in self.parameters]
         codes = proof.verdicts(
-            self.stability.atlas, self.scene.system, np.stack([column.reshape(-1) for column in given], axis=-1)
+            self.stability.atlas, self.scene.system, np.stack([column.reshape(-1) for column in full], axis=-1)
         )
         codes = codes.reshape(np.shape(verdict))
         return (codes != proof.UNDECIDED) & (codes == verdict)
@@ -452,12 +452,12 @@ class StoredAtlas:
 
     def in_parameters(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """``values`` with parameters of the atlas for physical data, and numbers for texts; fixed ones must agree."""
-        _, found = in_parameters(self.scene.system, values, self.scene.data)
-        for name in self.fixed.keys() & found.keys():
-            if not np.issubdtype(np.asarray(found[name]).dtype, np.number):
-                self.refuse(name, found[name])
-            check_same(name, found[name], self.fixed[name])
-        return {name: value for name, value in found.items() if name not in self.fixed}
+        _, parameters = in_parameters(self.scene.system, values, self.scene.data)
+        for name in self.fixed.keys() & parameters.keys():
+            if not np.issubdtype(np.asarray(parameters[name]).dtype, np.number):
+                self.refuse(name, parameters[name])
+            check_same(name, parameters[name], self.fixed[name])
+        return {name: value for name, value in parameters.items() if name not in self.fixed}
 
     def _names(self, values: Mapping[str, Any]) -> tuple[str, ...]:
         for name in values:
@@ -481,8 +481,8 @@ class StoredAtlas:
 
     def _axis(self, name: str, values: np.ndarray) -> Axis:
         shown, quantity = self.viewed_as(name, values)
-        given = (Axis(shown.name, shown, None, quantity),) if name in self.views else ()
-        return Axis(name, self.scene.system.parameter(name), None, values, given)
+        quantities = (Axis(shown.name, shown, None, quantity),) if name in self.views else ()
+        return Axis(name, self.scene.system.parameter(name), None, values, quantities)
 
     def _scene(self, axes: Mapping[str, np.ndarray], fixed: Mapping[str, Any], request: Request, zipped: bool) -> Scene:
         scene, system = self.scene, self.scene.system
@@ -512,17 +512,19 @@ def verify_proof(path: Path) -> tuple[str, str]:
         reason = proof.with_proofs(atlas, system)[1] or "allowed is to run its scene again"
         return "proof: none in this file", f"holds no proof; {reason}"
     errors = [(proof.proved_error(atlas, panel, system), panel.proved_error) for panel in proved]
-    found, claimed = max(errors, key=lambda pair: pair[0] / pair[1])
-    lines = f"proof: errors of {len(proved)} of {len(atlas.panels)} panels at most {found:.2e}, stored {claimed:.2e}"
-    wrong = f"proved_error = {claimed:.2e}: the proof gives {found:.2e}; allowed is to compute the file again"
+    computed, claimed = max(errors, key=lambda pair: pair[0] / pair[1])
+    lines = f"proof: errors of {len(proved)} of {len(atlas.panels)} panels at most {computed:.2e}, stored {claimed:.2e}"
+    wrong = f"proved_error = {claimed:.2e}: the proof gives {computed:.2e}; allowed is to compute the file again"
     columns = [np.linspace(*ends, _CELLS) for ends in stored.ranges.values()]
     points = np.stack([x.reshape(-1) for x in np.meshgrid(*columns, indexing="ij")], axis=-1)
-    codes, given = proof.verdicts(atlas, system, points), stored.stability.at(points)["verdict"]
-    both = (codes != proof.UNDECIDED) & (given != proof.UNDECIDED)
-    agree = int((both & (codes == given)).sum())
+    codes, stated = proof.verdicts(atlas, system, points), stored.stability.at(points)["verdict"]
+    both = (codes != proof.UNDECIDED) & (stated != proof.UNDECIDED)
+    agree = int((both & (codes == stated)).sum())
     line = f"{lines}; {agree} of {codes.size} verdicts of a chart proved"
     other = int(both.sum()) - agree
-    problem = wrong if found > claimed else f"{other} verdicts contradict the proof; allowed is none" if other else ""
+    problem = (
+        wrong if computed > claimed else f"{other} verdicts contradict the proof; allowed is none" if other else ""
+    )
     return line, problem
 
 

@@ -84,10 +84,10 @@ def in_units(table: AxisTable, parameter: Parameter, where: str, *, keep: bool) 
     That is its own unit or, with ``keep``, the unit of the first text. Raises :class:`InputError` for a number that is out
     of range, and for a text that is none.
     """
-    given = [*(end for end in (table.start, table.stop) if end is not None), *(table.values or ())]
-    for value in given:
+    numbers = [*(end for end in (table.start, table.stop) if end is not None), *(table.values or ())]
+    for value in numbers:
         checked(parameter, value, where)
-    texts = [value for value in given if isinstance(value, str)]
+    texts = [value for value in numbers if isinstance(value, str)]
     split = _units.split(texts[0]) if keep and texts else None
     described = in_unit(parameter, split[1]) if split else parameter
 
@@ -124,18 +124,18 @@ def check_count(name: str, table: AxisTable, continuous: bool) -> int:
     A ``continuous`` axis has two values, its ends.
     """
     field = f"axes.{name}"
-    given = [key for key in table.__struct_fields__ if getattr(table, key) is not None]
-    if continuous and (extra := [key for key in given if key not in ("start", "stop")]):
+    keys = [key for key in table.__struct_fields__ if getattr(table, key) is not None]
+    if continuous and (extra := [key for key in keys if key not in ("start", "stop")]):
         value = getattr(table, extra[0])
         raise InputError(f"{field}.{extra[0]} = {value!r}: an atlas has ranges; allowed is start and stop")
     if table.values is not None:
-        if given != ["values"]:
+        if keys != ["values"]:
             allowed = f"allowed is one of the two ({field} = [...] replaces the whole axis)"
-            raise InputError(f"{field}: values given together with {', '.join(given[:-1])}; {allowed}")
+            raise InputError(f"{field}: values given together with {', '.join(keys[:-1])}; {allowed}")
         if not table.values:
             raise InputError(f"{field}.values = []: empty axis; allowed is one value or more")
         return len(table.values)
-    if missing := [key for key in ("start", "stop") if key not in given]:
+    if missing := [key for key in ("start", "stop") if key not in keys]:
         allowed = "start and stop" if continuous else "start, stop and num, or values"
         raise InputError(f"{field}.{missing[0]}: missing; allowed is {allowed}")
     start, stop, num = cast(float, table.start), cast(float, table.stop), table.num
@@ -285,9 +285,9 @@ def _numbers(scene: Problem) -> dict[str, float]:
     equal or equally spaced.
     """
     names = scene.analysis.model(scene.system).parameters
-    given = {name: scene.fixed[name] for name in names if name in scene.fixed}
+    values = {name: scene.fixed[name] for name in names if name in scene.fixed}
     return {
         name: value
-        for name, value in given.items()
+        for name, value in values.items()
         if isinstance(value, float) and value not in (0.0, math.inf, scene.system.parameter(name).default)
     }

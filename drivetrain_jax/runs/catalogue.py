@@ -26,7 +26,10 @@ def _system_row(name: str) -> tuple[str, str]:
     except InputError as error:
         return name, str(error).partition(": ")[2]
     known = analysis_names()
-    served = [each if each in known else f"{each}: unknown{did_you_mean(each, known)}" for each in analyses_of(system)]
+    served = [
+        analysis if analysis in known else f"{analysis}: unknown{did_you_mean(analysis, known)}"
+        for analysis in analyses_of(system)
+    ]
     return name, f"{system.title}; analyses: {', '.join(served)}"
 
 
@@ -76,8 +79,8 @@ def _analysis_lines(name: str, system: type[System]) -> list[str]:
 
 
 def _parameter_row(parameter: Parameter, required: str = "required") -> tuple[str, ...]:
-    given = "none" if parameter.default in ((), "") else written(parameter.default)
-    default = required if parameter.default is None else f"default {given}"
+    standard = "none" if parameter.default in ((), "") else written(parameter.default)
+    default = required if parameter.default is None else f"default {standard}"
     default = f"default {parameter.derived}" if parameter.derived else default
     return parameter.name, f"[{parameter.units}]", parameter.long_name, default, parameter.allowed
 

@@ -68,8 +68,8 @@ class Job:
         if not config.jax_enable_x64:
             use_double_precision()
             if not config.jax_enable_x64:
-                found = "jax_enable_x64 = False: set by the context of this call"
-                raise InputError(f"{found}; allowed is jax.enable_x64(True)")
+                state = "jax_enable_x64 = False: set by the context of this call"
+                raise InputError(f"{state}; allowed is jax.enable_x64(True)")
         _programs.enable(short=True)
         return tuple(map(for_device, self.problem.solvers))
 
@@ -186,14 +186,14 @@ class Job:
         count = len(self.points(block))
         rows = np.concatenate([np.empty(0, np.int64), *(chunk.rows for chunk in chunks)])
         shapes = {name: values.shape[1:] for name, values in results[0].items()} if results else self._shapes
-        found = {}
+        joined = {}
         for variable in result_variables(self.problem):
             shape, blank = (count, *shapes[variable.name]), missing_value(variable)
             values = np.empty(shape, variable.dtype) if rows.size == count else np.full(shape, blank, variable.dtype)
             if results:
-                values[rows] = np.concatenate([each[variable.name] for each in results])
-            found[variable.name] = values
-        return found
+                values[rows] = np.concatenate([part[variable.name] for part in results])
+            joined[variable.name] = values
+        return joined
 
     @property
     def _shapes(self) -> dict[str, tuple[int, ...]]:
@@ -308,12 +308,12 @@ def _cheapest(solvers: Sequence[Solver], grid: Grid, points: np.ndarray) -> tupl
     columns = grid.arrays(points)
     best, effort, cost = np.full(points.shape, -1), np.zeros(points.shape), np.full(points.shape, np.inf)
     for index, solver in enumerate(solvers):
-        own = np.broadcast_to(np.asarray(solver.effort(columns), float), points.shape)
+        needed = np.broadcast_to(np.asarray(solver.effort(columns), float), points.shape)
         with np.errstate(over="ignore"):
-            own_cost = own * solver.unit_cost
+            own_cost = needed * solver.unit_cost
         # False for a cost of NaN or infinity.
         less = own_cost < cost
-        best[less], cost, effort = index, np.where(less, own_cost, cost), np.where(less, own, effort)
+        best[less], cost, effort = index, np.where(less, own_cost, cost), np.where(less, needed, effort)
     return best, np.ceil(np.clip(effort, 0, _MAX_EFFORT)).astype(np.int64)
 
 

@@ -70,13 +70,13 @@ def _batch(
     solver: Solver, grid: Grid, chunk: int, variables: Sequence[Variable]
 ) -> tuple[Callable[..., dict[str, Array]], tuple[Any, ...]]:
     """The function of a whole chunk, and the kinds of its arguments: varying parameters, fixed numbers, effort."""
-    own = {v.name: len(v.dims) + (grid.path is not None) for v in variables}
+    dims = {v.name: len(v.dims) + (grid.path is not None) for v in variables}
 
     def batch(columns: Mapping[str, Any], numbers: Mapping[str, Any], effort: Array) -> dict[str, Array]:
         # A result that does not depend on the varying parameters has no lanes yet.
         solved = solver.solve(grid.bind(columns, numbers), effort)
         results = {name: jnp.asarray(value) for name, value in solved.items()}
-        spread = {n: v if v.ndim > own[n] else v[..., None] for n, v in results.items()}
+        spread = {n: v if v.ndim > dims[n] else v[..., None] for n, v in results.items()}
         return {n: jnp.broadcast_to(v, (*v.shape[:-1], chunk)) for n, v in spread.items()}
 
     columns = {part.name: jax.ShapeDtypeStruct((chunk,), part.values.dtype) for part in grid.varying}

@@ -100,14 +100,14 @@ class Output:
             return None
         allowed = "allowed is a new file or a result of drivetrain_jax"
         try:
-            found = self.attribute("digest")
+            digest = self.attribute("digest")
         except InputError:
             if self.store == HDF5:
                 raise self._error(f"not a readable netCDF4/HDF5 file; {allowed}") from None
             return ""
-        if not isinstance(found, str):
+        if not isinstance(digest, str):
             raise self._error(f"not a result of drivetrain_jax; {allowed}")
-        return found
+        return digest
 
     def attribute(self, name: str) -> Any:
         """A global attribute of the present result."""
@@ -228,13 +228,13 @@ class Output:
         if not self.job.route.is_pointwise:
             return NO_REUSE
         paths = [Path(path) for path in reuse]
-        found = [find(self.job, path) for path in paths]
+        sources = [find(self.job, path) for path in paths]
         # Unfinished fresh work is resumed as fresh.
         if not (fresh or self.unfinished.get("fresh")):
             if isinstance(self._found, Damaged):
                 raise self.refusal
-            found += [self._found] if isinstance(self._found, ReusableResult) and self._found.is_covered else []
-        reused = combined(self.job, found)
+            sources += [self._found] if isinstance(self._found, ReusableResult) and self._found.is_covered else []
+        reused = combined(self.job, sources)
         if not fresh and self.unfinished and self.unfinished.get("reuses") != reused.digest:
             files = ", ".join(self.unfinished.get("reused_files") or ["no other result"])
             raise InputError(
@@ -344,20 +344,22 @@ def status(
     output, total = Output(Path(out), job), 0 if job.scene.analysis.continuous else job.total
     if output.state == "stale":
         return Status(total, 0, 0, "stale", reason=f"it {output.reason}")
-    done, found = None, []
+    done, outcomes_of_parts = None, []
     try:
         if output.state == "complete":
             done, outcomes = output.counted()
-            found = [outcomes]
+            outcomes_of_parts = [outcomes]
         elif output.state == "partial" and job.scene.analysis.continuous:
             stored = map(output.blocks.read, output.blocks.numbers())
-            found = [results[OUTCOME.name] for results in stored if results is not None]
+            outcomes_of_parts = [results[OUTCOME.name] for results in stored if results is not None]
         elif output.state == "partial" and job.route.is_pointwise:
             # A run through an atlas has no points before its end.
-            found = [results[OUTCOME.name] for _, results in output.finished()]
+            outcomes_of_parts = [results[OUTCOME.name] for _, results in output.finished()]
     except InputError as error:
         return Status(total, 0, 0, "stale", reason=str(error))
-    numbers, counts = np.unique(np.concatenate([np.empty(0, np.int8), *map(np.ravel, found)]), return_counts=True)
+    numbers, counts = np.unique(
+        np.concatenate([np.empty(0, np.int8), *map(np.ravel, outcomes_of_parts)]), return_counts=True
+    )
     codes = Counter(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
     done = codes.total() if done is None else done
     without = {o.name.lower(): codes[o] for o in Outcome if not o.has_value and codes[o]}
@@ -395,9 +397,9 @@ def open_result(path: str | Path) -> xr.Dataset:
     for points, results in output.finished():
         buffer.fill(points, results)
         count += results[OUTCOME.name].size
-    found = labelled(job.scene, buffer.lay_out(), {"digest": job.digest, "points_done": count})
+    result = labelled(job.scene, buffer.lay_out(), {"digest": job.digest, "points_done": count})
     title = f"{job.scene.title} (unfinished: {count} of {job.total} points)"
-    return with_pending(found).with_attrs(title=title).to_dataset()
+    return with_pending(result).with_attrs(title=title).to_dataset()
 
 
 def missed(out: Path, count: int, total: int) -> str:

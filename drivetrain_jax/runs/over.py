@@ -77,15 +77,15 @@ def sweep(
     if not callable(function):
         raise InputError(f"function = {shown(function)}: allowed is a function, such as drivetrain_jax.floquet")
     if not isinstance(over, Mapping) or not over:
-        given = f" = {shown(over)}" if over else ": empty"
-        raise InputError(f"over{given}; allowed are values by the name of a parameter")
+        value = f" = {shown(over)}" if over else ": empty"
+        raise InputError(f"over{value}; allowed are values by the name of a parameter")
     _check_concrete(system, over, options)
     of_another_package = isinstance(function, analyses.AnalysisFunction)
-    own = function.name if of_another_package else getattr(function, "__name__", "")
-    if of_another_package or (own in analysis_names() and getattr(analyses, own, None) is function):
-        _, analysis = analyses.model_and_analysis(own, system)
+    name = function.name if of_another_package else getattr(function, "__name__", "")
+    if of_another_package or (name in analysis_names() and getattr(analyses, name, None) is function):
+        _, analysis = analyses.model_and_analysis(name, system)
         if system.name in system_names() and get_system(system.name) is type(system):
-            return run(_scene_table(own, system, over, outputs, options), out=out, fresh=fresh)
+            return run(_scene_table(name, system, over, outputs, options), out=out, fresh=fresh)
         # A scene names its system, so any other class is that of a function.
         names = [outputs] if isinstance(outputs, str) else outputs
         request = make_request(type(system), analysis, names, options, {*over})
@@ -101,7 +101,7 @@ def _scene_table(
     """The scene of an analysis of an installed system."""
     # An empty list stands for a default of none.
     conversions = system.physical.conversions if system.physical else ()
-    varied = {*over, *(each.parameter for each in conversions if each.needs[0] in over)}
+    varied = {*over, *(rule.parameter for rule in conversions if rule.needs[0] in over)}
     varied |= {key for key, value in system.values.items() if isinstance(value, tuple) and not value}
     kept = {key: value for key, value in system.values.items() if key not in varied}
     fixed = {key: _plain(key, value, system.parameter(key).listed) for key, value in kept.items()}
@@ -130,10 +130,10 @@ def _row(name: str, values: Any) -> list[Any]:
 
 def _numbers(name: str, values: Any) -> list[float]:
     try:
-        given = np.asarray(values)
-        if given.dtype.kind in "bcM" or np.ma.is_masked(values):
-            raise TypeError(given.dtype)
-        array = given.astype(float)
+        row = np.asarray(values)
+        if row.dtype.kind in "bcM" or np.ma.is_masked(values):
+            raise TypeError(row.dtype)
+        array = row.astype(float)
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"over.{name}: got {shown(values)}; allowed are numbers") from None
     if array.ndim != 1 or not array.size:
@@ -162,17 +162,17 @@ def _function_scene(
     values = {}
     if OUTCOME.name in over:
         raise InputError(f"over.{OUTCOME.name}: the name of a result; allowed is another name")
-    for name, given in over.items():
+    for name, entries in over.items():
         described = known.get(entry_of(name)[0], Parameter(name, "1", name))
         scalar = replace(described, name=name, listed=False, broadcast=False)
-        row = [checked(scalar, value, "over.") for value in _row(name, given)]
+        row = [checked(scalar, value, "over.") for value in _row(name, entries)]
         values[name] = spread(AxisTable(values=[*_numbers(name, row)]), f"over.{name}")
     name = re.sub(r"\W", "_", getattr(function, "__name__", "function")).strip("_") or "value"
 
-    own = {"outputs": outputs} if results and outputs is not None else {}
+    keywords = {"outputs": outputs} if results and outputs is not None else {}
 
     def one(point: Mapping[str, Any]) -> dict[str, Array]:
-        return _named(function(replaced(system, point), **options, **own), name)
+        return _named(function(replaced(system, point), **options, **keywords), name)
 
     example = {key: jax.ShapeDtypeStruct((), float) for key in values}
     traced, shapes = jax.make_jaxpr(one, return_shape=True)(example)
@@ -227,9 +227,9 @@ def _kind(
         return values
 
     def solve(values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
-        found = one.call({key: values[key] for key in varies})
-        results = {v.name: found[v.name].astype(v.dtype) for v in variables}
-        return _with_outcome(results, found.get(OUTCOME.name))
+        returned = one.call({key: values[key] for key in varies})
+        results = {v.name: returned[v.name].astype(v.dtype) for v in variables}
+        return _with_outcome(results, returned.get(OUTCOME.name))
 
     def solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
         return (Solver(name, over_lanes(solve), chunk=_CHUNK),)
@@ -278,26 +278,26 @@ def _named(result: Any, name: str) -> dict[str, Array]:
     """The arrays of a result by name."""
     if isinstance(result, analyses.Result):
         result = result.variables
-    named, found = result if isinstance(result, Mapping) else {name: result}, {}
+    named, arrays = result if isinstance(result, Mapping) else {name: result}, {}
     for key, value in named.items():
         try:
-            found[str(key)] = jnp.asarray(value)
+            arrays[str(key)] = jnp.asarray(value)
         except (TypeError, ValueError):
-            given = f"a {type(value).__name__}" + (f" as {key!r}" if named is result else "")
-            raise InputError(f"function: returns {given}; allowed is an array or a flat dict of arrays") from None
+            what = f"a {type(value).__name__}" + (f" as {key!r}" if named is result else "")
+            raise InputError(f"function: returns {what}; allowed is an array or a flat dict of arrays") from None
         if not _STORED_NAME.fullmatch(str(key)) or key in _RESERVED:
             raise InputError(f"function: returns a result {key!r}; allowed is another name, without /")
-        array = found[str(key)]
+        array = arrays[str(key)]
         if key == OUTCOME.name and (array.ndim or not jnp.issubdtype(array.dtype, jnp.integer)):
             allowed = f"allowed is one integer, a code of the outcome from 0 to {max(Outcome)}, or another name"
             raise InputError(f"outcome: the function returns {array.dtype} of the shape {array.shape}; {allowed}")
-    return found
+    return arrays
 
 
 def _wanted(outputs: Sequence[str] | None, known: Sequence[str], name: str) -> list[str]:
     """Names of the results to store; the outcome is always one."""
-    given = known if outputs is None else [outputs] if isinstance(outputs, str) else outputs
-    wanted = [key for key in given if key != OUTCOME.name]
+    asked = known if outputs is None else [outputs] if isinstance(outputs, str) else outputs
+    wanted = [key for key in asked if key != OUTCOME.name]
     for key in wanted:
         if key not in known:
             raise InputError(f"outputs: {key!r} is not a result of {name}{nearest(str(key), known)}")

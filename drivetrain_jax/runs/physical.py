@@ -28,7 +28,7 @@ _POINT = "points"
 def described(system: type[System]) -> dict[str, Parameter]:
     """The parameters of ``system`` and its physical data by name."""
     data = system.physical.quantities if system.physical else ()
-    return {each.name: each for each in (*data, *system.parameters)}
+    return {quantity.name: quantity for quantity in (*data, *system.parameters)}
 
 
 def with_parameters(
@@ -44,15 +44,15 @@ def with_parameters(
         return axes, dict(fixed), {}
     known = _known(system, axes, zipped, fixed)
     everything = physical.all_converted(known)
-    found = {name: value for name, value in everything.items() if name not in physical.names}
+    parameters = {name: value for name, value in everything.items() if name not in physical.names}
     constant = {
         name: checked(system.parameter(name), _first(value), "fixed.")
-        for name, value in found.items()
+        for name, value in parameters.items()
         if not isinstance(value, Along)
     }
     others = {name: value for name, value in fixed.items() if name not in physical.names}
     data = {name: x for name, x in {**fixed, **everything}.items() if name in physical.names and not _varies(x)}
-    return _converted_axes(system, axes, zipped, swept, found), others | constant, data
+    return _converted_axes(system, axes, zipped, swept, parameters), others | constant, data
 
 
 def _varies(value: Any) -> bool:
@@ -76,11 +76,11 @@ def _known(system: type[System], axes: tuple[Axis, ...], zipped: bool, fixed: Ma
 
 
 def _converted_axes(
-    system: type[System], axes: tuple[Axis, ...], zipped: bool, swept: list[Axis], found: Mapping[str, Any]
+    system: type[System], axes: tuple[Axis, ...], zipped: bool, swept: list[Axis], parameters: Mapping[str, Any]
 ) -> tuple[Axis, ...]:
     """``axes`` with the parameters that vary in place of the quantities, and those that vary with other parameters."""
     columns: dict[str, list[Axis]] = {}
-    for name, value in found.items():
+    for name, value in parameters.items():
         entries = [(i, v) for i, v in enumerate(value)] if isinstance(value, tuple) else [(None, value)]
         for entry, values in entries:
             if isinstance(values, Along):
@@ -96,12 +96,12 @@ def _converted_axes(
     return tuple(converted)
 
 
-def _joined(columns: list[Axis], given: list[Axis]) -> list[Axis]:
-    """One axis of all ``columns``, which follow from the quantities ``given``."""
+def _joined(columns: list[Axis], quantities: list[Axis]) -> list[Axis]:
+    """One axis of all ``columns``, which follow from the quantities ``quantities``."""
     for axis in columns:
         for extreme in (axis.values.min(), axis.values.max()):
             checked(replace(axis.parameter, name=axis.name, listed=False), float(extreme), "axes.")
-    return [replace(columns[0], given=tuple(given), also=tuple(columns[1:]))] if columns else []
+    return [replace(columns[0], given=tuple(quantities), also=tuple(columns[1:]))] if columns else []
 
 
 def _first(value: Any) -> Any:
@@ -120,8 +120,8 @@ class GivenData:
 
     def quantity(self, parameter: str, value: float) -> tuple[str, float, str] | None:
         """Name, value and unit of the quantity behind a value of ``parameter``, None without one."""
-        found = self.back(parameter)
-        return None if found is None else (found[0].name, float(found[1](value)), found[0].units)
+        behind = self.back(parameter)
+        return None if behind is None else (behind[0].name, float(behind[1](value)), behind[0].units)
 
     def back(self, parameter: str) -> tuple[Parameter, Callable[[Any], Any]] | None:
         """The quantity behind ``parameter`` and the function that gives its values, None without one."""
@@ -129,7 +129,7 @@ class GivenData:
 
     def parameter_of(self, name: str) -> str:
         """The parameter that ``name`` stands for: itself, or the only one that follows from it."""
-        follow = [each.parameter for each in self.physical.conversions if name in each.needs]
+        follow = [rule.parameter for rule in self.physical.conversions if name in rule.needs]
         return follow[0] if len(follow) == 1 else name
 
 
@@ -146,13 +146,13 @@ def in_parameters(
     values = {n: _numbers(allowed[n], v, n in names) if n in allowed else v for n, v in given.items()}
     if physical is None or not (written or known or any(name in names for name in given)):
         return None, values
-    replaced = {each.parameter: each.needs[0] for each in physical.conversions if each.parameter in values}
+    replaced = {rule.parameter: rule.needs[0] for rule in physical.conversions if rule.parameter in values}
     # The atlas compares a value that repeats what follows from its own data.
     repeated = {parameter for parameter, name in replaced.items() if name in known.keys() - values}
     data = {**known, **values}
     pool = {n: Along(n, np.array(v)) if isinstance(v, tuple) else v for n, v in data.items() if n not in repeated}
-    found = {n: v for n, v in physical.converted(pool).items() if n not in names and n not in repeated}
-    converted = {n: tuple(v.values.tolist()) if isinstance(v, Along) else v for n, v in found.items()}
+    parameters = {n: v for n, v in physical.converted(pool).items() if n not in names and n not in repeated}
+    converted = {n: tuple(v.values.tolist()) if isinstance(v, Along) else v for n, v in parameters.items()}
     return GivenData(physical, data), {n: v for n, v in values.items() if n not in names} | converted
 
 
@@ -188,13 +188,13 @@ def read_table(path: Path) -> dict[str, Any]:
     rows = _rows(path).dropna(how="all")
     if len(rows) < 2:
         raise InputError(f"data = {str(path)!r}: no values; allowed is a row of names and rows of values")
-    found: dict[str, Any] = {}
+    columns: dict[str, Any] = {}
     for header, *cells in (rows[number].tolist() for number in rows):
         if isinstance(header, str):
             name, unit = _HEADER.fullmatch(header).groups()  # pyright: ignore[reportOptionalMemberAccess]
             if name == _NAMES:
                 continue
-            if name in found:
+            if name in columns:
                 raise InputError(f"data = {str(path)!r}: has two columns {name}; allowed is one")
             count = max((i + 1 for i, cell in enumerate(cells) if isinstance(cell, str)), default=0)
             if not count or not all(isinstance(cell, str) for cell in cells[:count]):
@@ -202,8 +202,8 @@ def read_table(path: Path) -> dict[str, Any]:
                 allowed = "allowed is a value in every row, or in the first"
                 raise InputError(f"data = {str(path)!r}: column {name} {where}; {allowed}")
             values = [_value(path, name, cell.strip(), unit) for cell in cells[:count]]
-            found[name] = values if count > 1 else values[0]
-    return found
+            columns[name] = values if count > 1 else values[0]
+    return columns
 
 
 def _value(path: Path, name: str, text: str, unit: str | None) -> Any:

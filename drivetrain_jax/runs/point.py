@@ -133,14 +133,14 @@ class PointResult:
 
     def _lines(self) -> list[str]:
         # An empty list is the default "none".
-        given = ", ".join(
+        parameters = ", ".join(
             _with_units(f"{n} = {written(v)}", self.parameter_units[n]) for n, v in self.parameters.items() if v != ()
         )
         listed = [n for n, v in self.values.items() if np.ndim(v) == 1]
         matrices = [n for n, v in self.values.items() if np.ndim(v) == 2]
         plain = [name for name in self.values if name not in (*listed, *matrices)]
         width = max(map(len, (*plain, "outcome")))
-        lines = [f"{self.system} {self.analysis} (method {self.method}), {given}"]
+        lines = [f"{self.system} {self.analysis} (method {self.method}), {parameters}"]
         if self.physical:
             data = (_with_units(f"{n} = {written(v)}", units) for n, (v, units) in self.physical.items())
             lines.append(f"  from {', '.join(data)}")
@@ -183,7 +183,7 @@ class PointResult:
 
 def _meaning(flags: Sequence[str], value: Any) -> Any:
     """The words of codes, in the shape of ``value``."""
-    return [_meaning(flags, each) for each in value] if np.ndim(value) else flags[int(value)]
+    return [_meaning(flags, code) for code in value] if np.ndim(value) else flags[int(value)]
 
 
 def _with_units(text: str, units: str) -> str:
@@ -239,25 +239,27 @@ def point(
     if sensitivities and "floquet" not in job.scene.system.models:
         raise InputError(f"sensitivities: {system} has no spectral radius; allowed for floquet")
     limit = None if amplitude is None else Limit.of(job.scene.system, amplitude)
-    found = _result(job, _compute(job))
+    result = _result(job, _compute(job))
     if sensitivities:
         # Local import: a point without sensitivities needs no atlas.
         from drivetrain_jax.runs.reply import gradient_lines, point_sensitivities
 
-        physical = {name: value for name, (value, _) in found.physical.items()}
-        effects = point_sensitivities(job.scene.system, found.parameters, physical) if found.outcome.has_value else None
-        found = replace(found, sensitivities=effects or [], _effects=gradient_lines(effects))
-    return found if limit is None else replace(found, forced=_forced(found, given, limit))
+        physical = {name: value for name, (value, _) in result.physical.items()}
+        effects = (
+            point_sensitivities(job.scene.system, result.parameters, physical) if result.outcome.has_value else None
+        )
+        result = replace(result, sensitivities=effects or [], _effects=gradient_lines(effects))
+    return result if limit is None else replace(result, forced=_forced(result, given, limit))
 
 
-def _forced(found: PointResult, given: Mapping[str, Any], limit: Limit) -> tuple[str, dict[str, Any]]:
+def _forced(result: PointResult, given: Mapping[str, Any], limit: Limit) -> tuple[str, dict[str, Any]]:
     """The comparison of the forced motion at the same point with a limit, as text and data."""
-    parameters = described(system_and_analysis(found.system, found.analysis)[0])
+    parameters = described(system_and_analysis(result.system, result.analysis)[0])
     parameters = {name: value for name, value in given.items() if name in parameters}
-    known = dict(found.values)
+    known = dict(result.values)
     for analysis, name in (("forced", "amplitude"), ("floquet", "verdict")):
         if name not in known:
-            known[name] = point(found.system, analysis, outputs=[name], **parameters)[name]
+            known[name] = point(result.system, analysis, outputs=[name], **parameters)[name]
     return limit.at_point(known["amplitude"], int(known["verdict"]))
 
 
@@ -276,7 +278,7 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
     numbers = {p.name for p in parameters.values() if p.is_number} - {path, *(v.name for v in analysis.variables)}
     if path is not None and system.physical:
         # What the path follows from is fixed like the path itself.
-        numbers -= {name for each in system.physical.conversions if each.parameter == path for name in each.needs}
+        numbers -= {name for rule in system.physical.conversions if rule.parameter == path for name in rule.needs}
     for name, value in given.items():
         if name not in names:
             guess = did_you_mean(name, (*names, "outputs", "amplitude")) or meant(name, parameters.values())
@@ -334,11 +336,11 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
 
 def _physical(job: Job) -> dict[str, tuple[Any, str]]:
     """The given physical data with their units."""
-    scene, found = job.scene, {}
+    scene, data = job.scene, {}
     for axis in scene.axes:
-        found |= {given.name: (given.values[0].item(), given.parameter.units) for given in axis.given}
+        data |= {quantity.name: (quantity.values[0].item(), quantity.parameter.units) for quantity in axis.given}
     known = described(scene.system)
-    return found | {name: (value, known[name].units) for name, value in scene.data.items()}
+    return data | {name: (value, known[name].units) for name, value in scene.data.items()}
 
 
 def _labels(job: Job, values: Mapping[str, Any], buffer: ResultBuffer) -> dict[str, Sequence[Any]]:

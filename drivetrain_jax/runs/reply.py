@@ -115,7 +115,7 @@ def growth_at(asked: AtlasQuery, results: Mapping[str, Any]) -> dict[str, float]
     system = asked.atlas.scene.system
     point = {**asked.atlas.fixed, **asked.values}
     known = asked.physical({name: value for name, value in point.items() if name == system.roles.get("speed")})
-    turns = next((found["value"] for found in known.values() if found["units"] == "rpm"), None)
+    turns = next((speed["value"] for speed in known.values() if speed["units"] == "rpm"), None)
     return growth_of(system, point, results, turns)
 
 
@@ -131,9 +131,9 @@ def growth_of(
         return {}
     # A period takes 1/frequency seconds; otherwise the unit of time is the turn.
     turn = 60 / turns if turns else 1.0
-    found = growth(radius, 1 / frequency if frequency else turn / system.periods_per_turn, turn)._asdict()
+    rates = growth(radius, 1 / frequency if frequency else turn / system.periods_per_turn, turn)._asdict()
     names = ("rate", "time") if frequency else ("rate", "per", "time", "turns") if turns else ("per", "turns")
-    return {n: float(x) for n, x in found.items() if np.isfinite(x) and n.startswith(names)}
+    return {n: float(x) for n, x in rates.items() if np.isfinite(x) and n.startswith(names)}
 
 
 def speed_in_rpm(system: type[System], physical: Mapping[str, tuple[Any, str]]) -> float | None:
@@ -143,16 +143,16 @@ def speed_in_rpm(system: type[System], physical: Mapping[str, tuple[Any, str]]) 
     return None if value is None else value * _units.factor(units, "rpm")
 
 
-def growth_lines(found: Mapping[str, float], width: int = 24, sign: str = "= ") -> list[str]:
+def growth_lines(rates: Mapping[str, float], width: int = 24, sign: str = "= ") -> list[str]:
     """The growth as text, after a word of this ``width`` and a ``sign``."""
-    if not found:
+    if not rates:
         return []
-    grows = found["rate"] > 0 if "rate" in found else found["per_turn"] > 1
+    grows = rates["rate"] > 0 if "rate" in rates else rates["per_turn"] > 1
     way = "double" if grows else "halve"
-    rate = f"{abs(found['rate']):.4g} 1/s" if "rate" in found else ""
-    per_turn = f"by a factor {found['per_turn']:.6g} per turn" if "per_turn" in found else ""
-    seconds = f"{found[f'time_to_{way}']:.4g} s" if f"time_to_{way}" in found else ""
-    turns = f"{found[f'turns_to_{way}']:.4g} turns" if f"turns_to_{way}" in found else ""
+    rate = f"{abs(rates['rate']):.4g} 1/s" if "rate" in rates else ""
+    per_turn = f"by a factor {rates['per_turn']:.6g} per turn" if "per_turn" in rates else ""
+    seconds = f"{rates[f'time_to_{way}']:.4g} s" if f"time_to_{way}" in rates else ""
+    turns = f"{rates[f'turns_to_{way}']:.4g} turns" if f"turns_to_{way}" in rates else ""
     ends = ", ".join(text for text in (seconds, turns) if text)
     word = "growth" if grows else "decay"
     return [
@@ -238,9 +238,9 @@ def _of_data(
     """
     data: dict[str, Any] = {name: value for name, value in point.items() if name != without}
     if shaft:
-        follow = {each.parameter: each.needs for each in shaft.physical.conversions}
-        own = {name: shaft.quantity(name, value) for name, value in point.items()}
-        ends = {known[0]: known[1] for name, known in own.items() if known and name != without}
+        follow = {rule.parameter: rule.needs for rule in shaft.physical.conversions}
+        quantities = {name: shaft.quantity(name, value) for name, value in point.items()}
+        ends = {known[0]: known[1] for name, known in quantities.items() if known and name != without}
         numbers = {name: x for name, x in shaft.data.items() if isinstance(x, (int, float)) and not isinstance(x, bool)}
         given = {name: x for name, x in numbers.items() if name in shaft.physical.names}
         given = {**given, **ends}
@@ -256,19 +256,19 @@ def _of_data(
         parameters = {**data, **converted}
         return answer({name: parameters[name] - x for name, x in point.items() if name in parameters}, data)
 
-    names, found = described(system), []
+    names, sensitivities = described(system), []
     for name, value in data.items():
         if names[name].integer:
             continue
         step = _STEP * abs(value) or _STEP
         slope = (at({**data, name: value + step}) - at({**data, name: value - step})) / (2 * step)
-        found.append(Sensitivity(name, names[name].units, slope, slope * value / 100))
-    return sorted(found, key=lambda each: -abs(each.percent))
+        sensitivities.append(Sensitivity(name, names[name].units, slope, slope * value / 100))
+    return sorted(sensitivities, key=lambda rule: -abs(rule.percent))
 
 
-def gradient_lines(found: list[Sensitivity] | None) -> list[str]:
+def gradient_lines(sensitivities: list[Sensitivity] | None) -> list[str]:
     """The sensitivities of the spectral radius as text."""
-    if found is None:
+    if sensitivities is None:
         return [
             "gradient of spectral_radius",
             "  none: two multipliers have the largest modulus, within the errors, or it cannot be computed",
@@ -276,32 +276,34 @@ def gradient_lines(found: list[Sensitivity] | None) -> list[str]:
     return [
         "gradient of spectral_radius, largest effect of 1 % first",
         *(
-            f"  {each.name:<24} {each.percent:+.6g} for +1 %, {each.slope:.6g}"
-            f"{'' if each.units == '1' else f' per {each.units}'}"
-            for each in found
+            f"  {effect.name:<24} {effect.percent:+.6g} for +1 %, {effect.slope:.6g}"
+            f"{'' if effect.units == '1' else f' per {effect.units}'}"
+            for effect in sensitivities
         ),
     ]
 
 
 def limit_line(asked: AtlasQuery, parameter: str, limit: Crossing | None, before: str = "") -> tuple[str, list[Any]]:
     """The sensitivities of a limit as a line of text and as data; empty without any."""
-    found = limit_sensitivities(asked, parameter, limit) if limit else []
-    if limit is None or not found:
+    sensitivities = limit_sensitivities(asked, parameter, limit) if limit else []
+    if limit is None or not sensitivities:
         return "", []
     physical = asked.shaft.quantity(parameter, limit.value) if asked.shaft else None
     name, _, units = physical or (parameter, 0.0, asked.atlas.scene.system.parameter(parameter).units)
-    least = _ROUNDING * abs(found[0].percent)
-    changes = ", ".join(f"{each.name} {each.percent:+.3g}" for each in found if abs(each.percent) > least)
+    least = _ROUNDING * abs(sensitivities[0].percent)
+    changes = ", ".join(
+        f"{effect.name} {effect.percent:+.3g}" for effect in sensitivities if abs(effect.percent) > least
+    )
     unit = "" if units == "1" else f" [{units}]"
-    return f"{before}+1 % of a value changes {name} by{unit}: {changes}", [x._asdict() for x in found]
+    return f"{before}+1 % of a value changes {name} by{unit}: {changes}", [x._asdict() for x in sensitivities]
 
 
 def radius_gradient(system: type[System], values: Mapping[str, float]) -> dict[str, float] | None:
     """Derivatives of the spectral radius by all parameters of ``system`` at ``values``, integers apart; None without any."""
     names = system.models["floquet"].parameters
-    found = np.asarray(_compiled_gradient(system, names)({name: np.float64(values[name]) for name in names}))
+    gradient = np.asarray(_compiled_gradient(system, names)({name: np.float64(values[name]) for name in names}))
     # JAX orders the leaves of a dictionary by key.
-    slopes = dict(zip(sorted(names), map(float, found), strict=True))
+    slopes = dict(zip(sorted(names), map(float, gradient), strict=True))
     real = [name for name in names if not system.parameter(name).integer]
     return {name: slopes[name] for name in real} if np.isfinite([slopes[name] for name in real]).all() else None
 
@@ -338,21 +340,21 @@ class Limit:
     own: str
 
     @classmethod
-    def of(cls, system: type[System], given: Any) -> Limit:
+    def of(cls, system: type[System], written: Any) -> Limit:
         """The checked limit; :class:`InputError` for a system without a forced response."""
         if "forced" not in system.models or system.displacements is None:
             raise InputError(
-                f"amplitude = {shown(given)}: {system.name} has no forced response; allowed for a system that has one"
+                f"amplitude = {shown(written)}: {system.name} has no forced response; allowed for a system that has one"
             )
-        own = system.state[0].units
-        largest = math.pi / 2 if own == "rad" else math.inf
-        parameter = Parameter("amplitude", own, "limit", lower=0.0, open_lower=True, upper=largest)
-        parts = _units.split(given) if isinstance(given, str) else None
+        units = system.state[0].units
+        largest = math.pi / 2 if units == "rad" else math.inf
+        parameter = Parameter("amplitude", units, "limit", lower=0.0, open_lower=True, upper=largest)
+        parts = _units.split(written) if isinstance(written, str) else None
         if parts and not parts[1]:
-            given = parts[0]
-        value = float(checked(parameter, given, ""))
+            written = parts[0]
+        value = float(checked(parameter, written, ""))
         names = tuple(map(str, system.displacements.values))
-        return cls(value, parts[1] if parts and parts[1] else own, names, own)
+        return cls(value, parts[1] if parts and parts[1] else units, names, units)
 
     def written(self, amplitude: float) -> str:
         """An amplitude as text, in the unit of the limit."""
@@ -367,11 +369,11 @@ class Limit:
         above = known and bool(np.max(amplitudes) > self.value)
         within = None if not known or (undecided and not above) else not (above or unstable)
         names = self.names or tuple(map(str, range(1, len(amplitudes) + 1)))
-        each = ", ".join(f"{name} {self.written(a)}" for name, a in zip(names, amplitudes, strict=True))
+        listed = ", ".join(f"{name} {self.written(a)}" for name, a in zip(names, amplitudes, strict=True))
         compared = "unstable: the motion grows beyond" if unstable else "above" if above else "within"
         doubt = " if the motion is stable, which is undecided" if within is None else ""
         values = [float(a) if np.isfinite(a) else None for a in amplitudes]
-        text = f"{each}; {compared} the limit of {self.written(self.value)}{doubt}" if known else "no value"
+        text = f"{listed}; {compared} the limit of {self.written(self.value)}{doubt}" if known else "no value"
         return text, {
             "amplitude": dict(zip(names, values, strict=True)),
             "limit": self.value,
@@ -447,7 +449,7 @@ class Along:
             "largest": self.largest,
             "where": self.where,
             "displacement": self.name,
-            "within": [list(each) for each in self.within],
+            "within": [list(ends) for ends in self.within],
         }
 
 
@@ -486,5 +488,7 @@ def forced_over(
     if amplitude is None:
         return [[] for _ in ranges], {}
     limit, speed = Limit.of(atlas.scene.system, amplitude), atlas.scene.system.roles["speed"]
-    found = [forced_along(atlas, limit, ends, at) for ends in ranges]
-    return [[each.text(lambda x: named(speed, x))] for each in found], {"forced": [each.data for each in found]}
+    compared = [forced_along(atlas, limit, ends, at) for ends in ranges]
+    return [[along.text(lambda x: named(speed, x))] for along in compared], {
+        "forced": [along.data for along in compared]
+    }

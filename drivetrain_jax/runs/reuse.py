@@ -114,11 +114,11 @@ class ReusedPoints:
 NO_REUSE = ReusedPoints()
 
 
-def combined(job: Job, found: Iterable[ReusableResult]) -> ReusedPoints:
+def combined(job: Job, results: Iterable[ReusableResult]) -> ReusedPoints:
     """The points of ``job`` that these results contain, each from the first result that has it."""
     free = np.ones(job.grid.size, bool)
     sources = []
-    for source in found:
+    for source in results:
         keep = free[source.ours]
         free[source.ours] = False
         sources.append(replace(source, theirs=source.theirs[keep], ours=source.ours[keep]))
@@ -176,14 +176,14 @@ def _same_points(theirs: Scene, grid: Grid, ours: Scene, our_grid: Grid) -> tupl
         return _same_rows(grid, our_grid)
     if not grid.zipped:
         return _within(theirs, grid, ours, our_grid)
-    own, listed = _within(ours, our_grid, theirs, grid)
-    own, first = np.unique(own, return_index=True)
-    return listed[first], own
+    rows, listed = _within(ours, our_grid, theirs, grid)
+    rows, first = np.unique(rows, return_index=True)
+    return listed[first], rows
 
 
 def _within(scene: Scene, grid: Grid, other: Scene, points: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Points of ``grid``, an outer product, that ``points`` has too: their numbers in both."""
-    axes, columns = ({axis.name: axis.values for axis in each.axes} for each in (grid, points))
+    axes, columns = ({axis.name: axis.values for axis in one.axes} for one in (grid, points))
     # Position along each axis for each value of the points; -1 for none.
     along = {name: _match(_values(scene, axes, name), values) for name, values in columns.items()}
     constant = {name: _match(axes[name], _values(other, columns, name))[:1] for name in axes.keys() - columns.keys()}
@@ -244,9 +244,11 @@ def _match(theirs: np.ndarray | None, ours: np.ndarray | None) -> np.ndarray:
     left = np.maximum(right - 1, 0)
     nearest = np.where(abs(rising[left] - ours) < abs(rising[right] - ours), left, right)
     sought, place = np.unique(np.asarray(ours, float), return_inverse=True)
-    own, other = _extents(rising)[nearest], _extents(sought)[place]
+    extent_of_theirs, other = _extents(rising)[nearest], _extents(sought)[place]
     # The ends of an axis are exact, its inner values have rounding errors; use the smaller tolerance of the two axes.
-    extent = np.where((own > 0) & (other > 0), np.minimum(own, other), np.maximum(own, other))
+    extent = np.where(
+        (extent_of_theirs > 0) & (other > 0), np.minimum(extent_of_theirs, other), np.maximum(extent_of_theirs, other)
+    )
     equal = abs(rising[nearest] - ours) <= _ROUNDINGS * (abs(rising[nearest]) + extent)
     return np.where(equal, order[nearest], -1)
 
@@ -260,13 +262,13 @@ def _extents(rising: np.ndarray) -> np.ndarray:
 
 def _same_rows(grid: Grid, other: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Rows of a list of points for each equal row of another list that varies the same parameters."""
-    theirs, ours = ({axis.name: axis.values.tolist() for axis in each.axes} for each in (grid, other))
+    theirs, ours = ({axis.name: axis.values.tolist() for axis in one.axes} for one in (grid, other))
     if theirs.keys() != ours.keys():
         return _NOTHING
     place = {row: i for i, row in enumerate(zip(*theirs.values(), strict=True))}
     rows = zip(*(ours[name] for name in theirs), strict=True)
-    found = np.array([(place[row], i) for i, row in enumerate(rows) if row in place], np.int64).reshape(-1, 2)
-    return found[:, 0], found[:, 1]
+    pairs = np.array([(place[row], i) for i, row in enumerate(rows) if row in place], np.int64).reshape(-1, 2)
+    return pairs[:, 0], pairs[:, 1]
 
 
 def differences(stored: Mapping[str, Any], job: Job) -> list[str]:
@@ -277,8 +279,8 @@ def differences(stored: Mapping[str, Any], job: Job) -> list[str]:
     text = stored.get("scene")
     if is_of_function(text) and not job.scene.is_named:
         same = "the values of over or the outputs differ"
-        own = same if text == job.scene.text else "the function, an option or a fixed value differs"
-        return list(_of_code(stored, job)) or [own]
+        reason = same if text == job.scene.text else "the function, an option or a fixed value differs"
+        return list(_of_code(stored, job)) or [reason]
     try:
         scene = restore_scene(text)
     except InputError as error:
@@ -336,7 +338,7 @@ def _of_axes(theirs: Scene, ours: Scene) -> Iterator[str]:
         return
     for name, values in new.items():
         if not np.array_equal(values, old[name]):
-            now, before = (_range(each, ours) for each in (values, old[name]))
+            now, before = (_range(row, ours) for row in (values, old[name]))
             yield f"{'points' if ours.zipped else 'axes'}.{name} has {now}, had {before}"
 
 
@@ -353,18 +355,18 @@ def _of_numerics(stored: str | None, present: Mapping[str, Any]) -> list[str]:
         old = json.loads(stored or "")
     except ValueError:
         return ["the code, a version or the machine differs"]
-    found = []
+    changes = []
     for key, value in present.items():
         before = old.get(key)
         if isinstance(value, Mapping) and isinstance(before, Mapping):
             changed = [name for name in sorted({*value, *before}) if value.get(name) != before.get(name)]
             if key == "versions":
-                found += [f"{name} is {value.get(name)}, was {before.get(name)}" for name in changed]
+                changes += [f"{name} is {value.get(name)}, was {before.get(name)}" for name in changed]
             elif changed:
-                found.append(f"the code has changed in {', '.join(changed[:3])}{', ...' if len(changed) > 3 else ''}")
+                changes.append(f"the code has changed in {', '.join(changed[:3])}{', ...' if len(changed) > 3 else ''}")
         elif value != before:
-            found.append(f"{key} is {_text(value)}, was {_text(before)}")
-    return found or ["the code, a version or the machine differs"]
+            changes.append(f"{key} is {_text(value)}, was {_text(before)}")
+    return changes or ["the code, a version or the machine differs"]
 
 
 def _text(value: Any) -> str:

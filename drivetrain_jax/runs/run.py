@@ -122,13 +122,13 @@ def run_to_file(
     return _into(output, output.reused_points(paths, fresh), fresh, executor, report)
 
 
-def _store(out: Path, given: str | None) -> str:
+def _store(out: Path, asked: str | None) -> str:
     """The store for ``out``; :class:`InputError` for an HDF5 file with the name of a Zarr store."""
     named = out.suffix.lower() == ".zarr"
-    if named and given == HDF5:
+    if named and asked == HDF5:
         allowed = f"allowed is a name such as {out.stem}.nc, or `drivetrain run --store zarr`"
         raise InputError(f"out = {str(out)!r}: names a Zarr store; {allowed}")
-    return given or (ZARR if named else HDF5)
+    return asked or (ZARR if named else HDF5)
 
 
 def _into(output: Output, reused: ReusedPoints, fresh: bool, executor: Threads, report: Report | None) -> Progress:

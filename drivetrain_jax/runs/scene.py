@@ -319,17 +319,17 @@ def _check_ranges(axes: Mapping[str, Any], points: Mapping[str, Any], analysis: 
         raise InputError(f"axes: {len(axes)} are given; {analysis.name} allows 1 to {MAX_RANGES}")
 
 
-def _axis_table(system: type[System], parameter: Parameter, name: str, given: Any) -> tuple[AxisTable, Parameter]:
+def _axis_table(system: type[System], parameter: Parameter, name: str, keys: Any) -> tuple[AxisTable, Parameter]:
     """The keys of an axis with numbers for texts, and the range of a value in their unit."""
-    if isinstance(given, list):
-        given = {"values": given}
-    if not isinstance(given, Mapping):
+    if isinstance(keys, list):
+        keys = {"values": keys}
+    if not isinstance(keys, Mapping):
         allowed = "allowed is a table { start, stop, num } or { values }, or a row of values"
-        raise InputError(f"axes.{name} = {shown(given)}: {allowed}")
-    if isinstance(num := given.get("num"), float) and num.is_integer():
+        raise InputError(f"axes.{name} = {shown(keys)}: {allowed}")
+    if isinstance(num := keys.get("num"), float) and num.is_integer():
         # Options and parameters also accept 1e3 for 1000.
-        given = {**given, "num": int(num)}
-    table = toml.converted(given, AxisTable, f"axes.{name}.")
+        keys = {**keys, "num": int(num)}
+    table = toml.converted(keys, AxisTable, f"axes.{name}.")
     return in_units(table, parameter, "axes.", keep=_is_physical(system, name))
 
 
@@ -383,7 +383,7 @@ def _swept_parameter(system: type[System], where: str, name: str) -> Parameter:
 def unknown_parameter(system: type[System], name: str) -> str:
     """The message for an unknown parameter ``name``, with the allowed names."""
     data = system.physical.names if system.physical else ()
-    own = [p.name for p in system.parameters]
+    parameters = [p.name for p in system.parameters]
     guess = meant(name, described(system).values())
-    listed = f"; allowed is {', '.join(own)}" + (f", or physical data: {', '.join(data)}" if data else "")
+    listed = f"; allowed is {', '.join(parameters)}" + (f", or physical data: {', '.join(data)}" if data else "")
     return f"unknown parameter{guess}{listed}"

@@ -109,18 +109,18 @@ def _replace(tree: dict[str, Any], key: str, value: Any) -> None:
     tree[last] = value
 
 
-def converted(given: Any, kind: type, where: str) -> Any:
-    """``given`` converted to the table ``kind``; ``where`` is the dotted prefix of its fields in messages."""
+def converted(tree: Any, kind: type, where: str) -> Any:
+    """``tree`` converted to the table ``kind``; ``where`` is the dotted prefix of its fields in messages."""
     names = [field.name for field in msgspec.structs.fields(kind)]
-    for key in given:
+    for key in tree:
         if key not in names:
-            raise InputError(f"{where}{key} = {shown(given[key])}: unknown key{nearest(str(key), names)}")
+            raise InputError(f"{where}{key} = {shown(tree[key])}: unknown key{nearest(str(key), names)}")
     try:
-        return msgspec.convert(given, kind)
+        return msgspec.convert(tree, kind)
     except msgspec.ValidationError as error:
         reason, _, path = str(error).partition(" - at `$.")
         name = re.split(r"\W", path, maxsplit=1)[0]
-        field = f"{where}{name} = {shown(given.get(name))}" if name else where.rstrip(".") or "scene"
+        field = f"{where}{name} = {shown(tree.get(name))}" if name else where.rstrip(".") or "scene"
         raise InputError(f"{field}: {reason[:1].lower()}{reason[1:]}") from None
 
 

@@ -117,8 +117,8 @@ class Threads:
             return job.compute(chunks[position]) if chunks else {}
 
         with closing(run_threads(tasks(), compute, self._count or usable_cores())) as computed:
-            for (block, chunks, results, position), found in computed:
-                results[position] = found
+            for (block, chunks, results, position), computed_chunk in computed:
+                results[position] = computed_chunk
                 if chunks:
                     tick(chunks[position].points.size)
                 if len(results) >= len(chunks):
@@ -316,9 +316,9 @@ def make_executor(threads: int | None = None, workers: int | None = None, dask: 
     if dask is not None and not re.match(r"local:[1-9]\d*$|\w+://", str(dask)):
         raise InputError(f"dask = {dask!r}: allowed is tcp://HOST:PORT or local:N with N >= 1")
     settings = {"threads": threads, "workers": workers, "dask": dask}
-    given = [name for name, value in settings.items() if value is not None]
-    if len(given) > 1:
-        raise InputError(f"{given[0]}: given together with {given[1]}; allowed is one of them")
+    named = [name for name, value in settings.items() if value is not None]
+    if len(named) > 1:
+        raise InputError(f"{named[0]}: given together with {named[1]}; allowed is one of them")
     if workers is None and dask is None:
         return Threads(threads)
     return Cluster(dask or f"local:{workers}")

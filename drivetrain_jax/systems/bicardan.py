@@ -142,10 +142,17 @@ def check(fixed: Mapping[str, Any]) -> None:
                 )
     mass = entries_of(fixed.get("rhoA", ()), segments, 1.0)
     for name in ("rhoI", "rhoIp"):
-        for i, (each, own) in enumerate(zip(mass, entries_of(fixed.get(name, ()), segments), strict=True)):
+        for i, (mass_of_segment, rotary) in enumerate(
+            zip(mass, entries_of(fixed.get(name, ()), segments), strict=True)
+        ):
             # Traced values are not checked.
-            if isinstance(each, (int, float)) and isinstance(own, (int, float)) and each == 0 and own > 0:
-                raise ValueError(f"{name}[{i}] = {own:g}: allowed is 0 for a segment without mass (rhoA[{i}] = 0)")
+            if (
+                isinstance(mass_of_segment, (int, float))
+                and isinstance(rotary, (int, float))
+                and mass_of_segment == 0
+                and rotary > 0
+            ):
+                raise ValueError(f"{name}[{i}] = {rotary:g}: allowed is 0 for a segment without mass (rhoA[{i}] = 0)")
 
 
 # Stiffnesses [N m2] and masses per length [kg/m] beyond this range may overflow or underflow on the way to frequencies.

@@ -202,9 +202,9 @@ class _Lines:
         for radius in _ELLIPSES:
             # Each term is integrated with an error of at most 8 M radius^(1-P)/(radius-1), M its bound on the ellipse.
             across = self.largest * self.half * self.rates(radius)[0]
-            found = 16 * across * radius ** (1.0 - _NODES) / (radius - 1)
-            found = found * np.exp(np.minimum((1 + (radius + 1 / radius) / 2) * across, 600)) * sum(powers)
-            left_out = np.fmin(left_out, found)
+            bound = 16 * across * radius ** (1.0 - _NODES) / (radius - 1)
+            bound = bound * np.exp(np.minimum((1 + (radius + 1 / radius) / 2) * across, 600)) * sum(powers)
+            left_out = np.fmin(left_out, bound)
         tail = 2 * np.exp(np.minimum(2 * x, 600)) * (2 * x) ** (_TERMS + 1) / math.factorial(_TERMS + 1)
         moved = 4 * UNIT * (self.middle + self.half) * steep
         step = rounding(_NODES + 4 + _TABLES + _ENTRY + roundings) + moved
@@ -264,18 +264,18 @@ def propagators(
             part = (part + term) * ratio
         parts.append(part + np.eye(4))
         left.append(parts[-1] @ left[-1])
-    right, before, behind, own = np.broadcast_to(end * np.eye(4), left[0].shape), [], [], []
+    right, before, behind, errors = np.broadcast_to(end * np.eye(4), left[0].shape), [], [], []
     for i in reversed(range(len(parts))):
         scale, inverse = balance[i], 1 / np.swapaxes(balance[i], -1, -2)
         before.append(_two_norm(scale * left[i]))
         behind.append(_two_norm(right * inverse))
-        own.append(left_out[i] + rounded[i] + rounding(8) * frobenius(scale * parts[i] * inverse))
+        errors.append(left_out[i] + rounded[i] + rounding(8) * frobenius(scale * parts[i] * inverse))
         right = right @ parts[i]
     # Terms of second order: the product A_j A_i^-1 of consecutive parts is at most |A_j| |A_i|^3/det A_i, and det A_i falls.
     # The factor 8 covers the different scales of neighbours.
-    most, last, total = np.max(before, axis=0), np.max(behind, axis=0), np.sum(own, axis=0)
+    most, last, total = np.max(before, axis=0), np.max(behind, axis=0), np.sum(errors, axis=0)
     second = 8 * most**4 * total * np.exp(-_log_determinant(c, s[:, None], values) / 2)
-    error = sum((a + second * most) * (b + second * last) * e for a, b, e in zip(before, behind, own, strict=True))
+    error = sum((a + second * most) * (b + second * last) * e for a, b, e in zip(before, behind, errors, strict=True))
     phi = end * left[-1]
     return phi, np.where(second < _SECOND, error * (1 + 1e-9) + rounding(20) * frobenius(phi), np.inf)
 
@@ -315,9 +315,9 @@ def _log_determinant(c: Any, s: Any, values: Mapping[str, Any]) -> np.ndarray:
 
 
 def _log_determinant_at(values: Columns) -> np.ndarray:
-    found = _log_determinant(np.cos(values["beta"]), 1 / np.asarray(values["Omega"]), values)
+    logarithm = _log_determinant(np.cos(values["beta"]), 1 / np.asarray(values["Omega"]), values)
     # The smallest damping must not count as none by underflow.
-    return np.where(np.equal(values["zeta"], 0), 0.0, np.minimum(found, -np.finfo(float).tiny))
+    return np.where(np.equal(values["zeta"], 0), 0.0, np.minimum(logarithm, -np.finfo(float).tiny))
 
 
 ENCLOSURE = Enclosure(("beta", "Omega"), _enclosed, _coordinate, _log_determinant_at)

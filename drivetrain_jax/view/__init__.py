@@ -60,7 +60,7 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     from drivetrain_jax.view.style import STYLE
 
     with rc_context(STYLE):
-        datasets, figure = [prepare(each) for each in (dataset, *others)], None
+        datasets, figure = [prepare(one) for one in (dataset, *others)], None
         if record.figure:
             module, _, name = record.figure.partition(".")
             figure = getattr(import_module(f"drivetrain_jax.view.{module}"), name)(*datasets)

@@ -156,8 +156,10 @@ def horizontal_first(dataset: xr.Dataset, names: Sequence[str]) -> list[str]:
 
 def varying_parameters(dataset: xr.Dataset) -> list[str]:
     """Parameters with several values in a list of points; raises :class:`InputError` without one."""
-    own = {str(name): c for name, c in dataset.coords.items() if c.dims == ("point",) and name not in _NO_PARAMETERS}
-    varying = [name for name, values in own.items() if np.unique(values).size > 1]
+    columns = {
+        str(name): c for name, c in dataset.coords.items() if c.dims == ("point",) and name not in _NO_PARAMETERS
+    }
+    varying = [name for name, values in columns.items() if np.unique(values).size > 1]
     if not varying:
         raise InputError("points: all points are the same, there is nothing to plot; give points that differ")
     return varying
@@ -387,12 +389,12 @@ def table_rows(dataset: xr.Dataset, digits: str = ".6g") -> list[tuple[str, str,
         label, words = str(variable.attrs.get("long_name", name)), flags(variable)
         for place in np.ndindex(variable.shape):
             entry = variable[place]
-            own = [
+            labels = [
                 f", {dim} {entry[dim].item() if dim in entry.coords else k}"
                 for dim, k in zip(variable.dims, place, strict=True)
             ]
             value = words[int(entry)].replace("_", " ") if words else f"{entry.item():{digits}}"
-            rows.append((label + "".join(own), value, "" if units == "1" else units))
+            rows.append((label + "".join(labels), value, "" if units == "1" else units))
     return rows
 
 
@@ -517,10 +519,10 @@ def own_dimension(dataset: xr.Dataset, name: str) -> str:
 
 def split(parts: Sequence[xr.Dataset], name: str) -> list[tuple[str, list[xr.Dataset]]]:
     """Rows of :func:`maps` for every entry of the variable's own dimension; without labels for the first, the largest."""
-    own = own_dimension(parts[0], name)
-    entries = range(parts[0].sizes[own] if own in parts[0].coords else 1) if own else ()
-    numbered = [part.assign_coords({own: range(part.sizes[own])} | dict(part.coords)) for part in parts if own]
-    return [(name, [part.isel({own: k}) for part in numbered]) for k in entries] or [(name, list(parts))]
+    inner = own_dimension(parts[0], name)
+    entries = range(parts[0].sizes[inner] if inner in parts[0].coords else 1) if inner else ()
+    numbered = [part.assign_coords({inner: range(part.sizes[inner])} | dict(part.coords)) for part in parts if inner]
+    return [(name, [part.isel({inner: k}) for part in numbered]) for k in entries] or [(name, list(parts))]
 
 
 def _title(part: xr.Dataset, names: Sequence[str]) -> str:
@@ -634,23 +636,26 @@ def draw_lines(
             distance = np.abs(values.values[np.isfinite(values.values) & (values.values != 0)])
             linear = 10.0 ** np.floor(np.log10(max(np.quantile(distance, 0.1), _ROUNDING))) if distance.size else 1.0
             axes.set_yscale("symlog", linthresh=linear)
-        own = next((str(dim) for dim in values.dims if dim != along), None)
-        for k in range(values.sizes[own] if own else 1):
-            line = values.isel({own: k}) if own else values
-            names = [entry_name(own, line[own].item() if own in line.coords else k)] if own else []
+        inner = next((str(dim) for dim in values.dims if dim != along), None)
+        for k in range(values.sizes[inner] if inner else 1):
+            line = values.isel({inner: k}) if inner else values
+            names = [entry_name(inner, line[inner].item() if inner in line.coords else k)] if inner else []
             names += [" ".join(word for word in titles[number] if word not in common)] if len(keys) > 1 else []
-            look: dict[str, Any] = {"color": colours[(k if own else number) % len(colours)], "label": ", ".join(names)}
-            look |= {"linestyle": _DASHES[number if own else 0]} | style
-            look |= {"linewidth": 0.9 + 0.6 * (values.sizes[own] - 1 - k)} if wider and own else {}
+            look: dict[str, Any] = {
+                "color": colours[(k if inner else number) % len(colours)],
+                "label": ", ".join(names),
+            }
+            look |= {"linestyle": _DASHES[number if inner else 0]} | style
+            look |= {"linewidth": 0.9 + 0.6 * (values.sizes[inner] - 1 - k)} if wider and inner else {}
             drawn = axes.plot(x, line, **look)
             sheet.add(*(drawn if names and named else ()))
             if bound in dataset:
                 ends = [_scaled(dataset, key, known + side * factor * dataset[bound])[0] for side in (-1, 1)]
-                low, high = (end.isel({own: k}) if own else end for end in ends)
+                low, high = (end.isel({inner: k}) if inner else end for end in ends)
                 band = {"color": look["color"], "alpha": 0.25, "linewidth": 0, "label": name}
                 sheet.add(axes.fill_between(x, low, high, **band))
         if key in _SUMMED:
-            sheet.add(*axes.plot(x, values.sum(own, skipna=False), color=FRAME_GREY, linestyle="--", label="sum"))
+            sheet.add(*axes.plot(x, values.sum(inner, skipna=False), color=FRAME_GREY, linestyle="--", label="sum"))
         if _is_radius(key) or key.startswith("lyapunov"):
             sheet.add(axes.axhline(0, label="limit of stability", **LIMIT))
         if dataset[key].dtype.kind in "iu":

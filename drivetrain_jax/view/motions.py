@@ -52,8 +52,8 @@ def history(dataset: xr.Dataset) -> Figure:
     shown = [names[0], names[len(names) // 2]] if names else ["displacement", "rate"]
     charts.require(dataset, *shown)
     # Of a state with an axis of its own, the last entry: the free end of a driveline.
-    own = {d: -1 for d in dataset[shown[0]].dims if d not in (*dataset["outcome"].dims, "time")}
-    dataset = dataset.isel(own)
+    inner = {d: -1 for d in dataset[shown[0]].dims if d not in (*dataset["outcome"].dims, "time")}
+    dataset = dataset.isel(inner)
     if charts.sweep_axes(dataset):
         return _histories(dataset, shown)
     sheet = Sheet(2, 2, height=2.75, sharex=False, sharey=False)
@@ -73,9 +73,9 @@ def _histories(dataset: xr.Dataset, shown: Sequence[str]) -> Figure:
     sheet = Sheet(len(parts), 3, height=1.7, sharex="col", sharey=False)
     for row, part in zip(sheet.axes, parts, strict=True):
         sheet.add(*_draw(part, row, shown, "time"))
-        own = {other: c for other, c in part.coords.items() if not c.ndim and other != "point"}
-        varies = [name] if name in own else own
-        row[1].set_title(", ".join(coordinate_text(own[other]) for other in varies), color=FRAME_GREY, size=8)
+        coordinates = {other: c for other, c in part.coords.items() if not c.ndim and other != "point"}
+        varies = [name] if name in coordinates else coordinates
+        row[1].set_title(", ".join(coordinate_text(coordinates[other]) for other in varies), color=FRAME_GREY, size=8)
         for axes in row if part is not parts[-1] else ():
             axes.set_xlabel("")
     return sheet.finish(dataset)

@@ -260,15 +260,15 @@ def _orbits(dataset: xr.Dataset, path: str) -> Figure:
     if charts.sweep_axes(dataset) != [path]:
         raise charts.wrong_axes(dataset, f"{path} of several values")
     amplitude, x = dataset["branch_amplitude"], dataset[path].values
-    (own,) = (str(dim) for dim in amplitude.dims if dim not in (path, "branch"))
-    sheet = Sheet(amplitude.sizes[own], height=2.6, sharey=False)
+    (displaced,) = (str(dim) for dim in amplitude.dims if dim not in (path, "branch"))
+    sheet = Sheet(amplitude.sizes[displaced], height=2.6, sharey=False)
     stability = dataset["branch_stability"].transpose(path, "branch").values
-    for (axes,), name, colour in zip(sheet.axes, amplitude[own].values.tolist(), LINE_COLOURS, strict=False):
-        values = amplitude.sel({own: name}).transpose(path, "branch").values
+    for (axes,), name, colour in zip(sheet.axes, amplitude[displaced].values.tolist(), LINE_COLOURS, strict=False):
+        values = amplitude.sel({displaced: name}).transpose(path, "branch").values
         for kind, label, face in ((_STABLE, "stable", colour), (_UNSTABLE, "unstable", "none")):
             place, branch = np.nonzero(stability == kind)
             style = {"color": colour, "markerfacecolor": face, "markersize": 2.4, "markeredgewidth": 0.7}
-            label = f"{label}, {charts.entry_name(own, name)}"
+            label = f"{label}, {charts.entry_name(displaced, name)}"
             sheet.add(*(axes.plot(x[place], values[place, branch], "o", **style, label=label) if place.size else ()))
         _draw_bifurcations(sheet, axes, dataset)
         axes.set_ylim(bottom=0.0)

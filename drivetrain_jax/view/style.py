@@ -202,14 +202,14 @@ def caption(dataset: xr.Dataset) -> str:
 
     Joined results may differ in their fixed parameters, so only their coordinates are shown.
     """
-    given = _given(dataset)
+    named_in = _given(dataset)
     # Physical data are shown as they were given, in place of the parameters that follow from them.
     tables = (json.loads(dataset.attrs.get(name, "{}")) for name in ("fixed_parameters", "physical_data"))
     fixed = {name: entry for table in tables for name, entry in table.items()}
     varies = {str(name) for name in (*dataset.coords, *dataset.dims)}
-    shown = [] if is_joined(dataset) else [name for name in fixed if name in given["fixed"] and name not in varies]
+    shown = [] if is_joined(dataset) else [name for name in fixed if name in named_in["fixed"] and name not in varies]
     parts = [_fixed_text(dataset, name, fixed[name]) for name in shown]
-    named = set().union(*given.values())
+    named = set().union(*named_in.values())
     for name, coordinate in dataset.coords.items():
         # An entry of a list may be shown as a part of the whole.
         whole = scene_key(coordinate).partition("[")[0]
@@ -270,15 +270,15 @@ def listed(units: str | Sequence[str]) -> list[str]:
     listing = units.split(",") if isinstance(units, str) else units
     if not isinstance(listing, (list, tuple)) or not all(isinstance(unit, str) for unit in listing):
         raise InputError(f'units = {shown(units)}: allowed are units such as "rpm,deg", or a list of them')
-    found = [unit.strip() for unit in listing]
-    for number, unit in enumerate(found):
+    names = [unit.strip() for unit in listing]
+    for number, unit in enumerate(names):
         try:
             _units.number(f"1 {unit}", unit)
         except _units.UnitError:
             raise InputError(f"units = {unit!r}: not a unit; allowed are units such as rpm, deg or mm") from None
-        if twin := next((other for other in found[:number] if size(unit, other)), None):
+        if twin := next((other for other in names[:number] if size(unit, other)), None):
             raise InputError(f"units = {unit!r}: measures the same as {twin}; allowed is one of them")
-    return found
+    return names
 
 
 def size(units: str, unit: str) -> float | None:
@@ -329,8 +329,8 @@ def unit_of(dataset: xr.Dataset, name: str, units: str) -> tuple[float, str]:
     entries = [scene.get(table, {}).get(name) for table in ("axes", "points", "fixed")]
     entries = [part for entry in entries for part in (entry.values() if isinstance(entry, dict) else [entry])]
     texts = [x for part in entries for x in (part if isinstance(part, list) else [part]) if isinstance(x, str)]
-    given = [written[1] for text in texts[:1] if (written := _units.split(text)) and written[1]]
-    return suitable(units, [*json.loads(dataset.attrs.get(ASKED, "[]")), *given])
+    written_units = [written[1] for text in texts[:1] if (written := _units.split(text)) and written[1]]
+    return suitable(units, [*json.loads(dataset.attrs.get(ASKED, "[]")), *written_units])
 
 
 def scene_of(dataset: xr.Dataset) -> dict[str, Any]:
@@ -386,7 +386,7 @@ def prefixed(values: Any, units: str) -> tuple[float, str]:
 
 def with_prefixes(dataset: xr.Dataset) -> xr.Dataset:
     """``dataset`` with its axes and results in units with suitable prefixes."""
-    found: dict[Hashable, tuple[float, str]] = {}
+    prefixes: dict[Hashable, tuple[float, str]] = {}
     changed = {}
     for name, variable in sorted(dataset.variables.items(), key=lambda item: len(str(item[0]))):
         units = str(variable.attrs.get("units", ""))
@@ -395,8 +395,8 @@ def with_prefixes(dataset: xr.Dataset) -> xr.Dataset:
         if not wanted or not (variable.ndim or name in dataset.data_vars):
             continue
         # One prefix for results of the same unit, which may share an axis, and for NAME, `boundary_NAME`, `tip_NAME_error`.
-        axes = [axis for axis, (_, known) in found.items() if f"_{axis}" in str(name) and known.endswith(units)]
+        axes = [axis for axis, (_, known) in prefixes.items() if f"_{axis}" in str(name) and known.endswith(units)]
         key = units if name in dataset.data_vars else (axes or [name])[-1]
-        factor, written = found.setdefault(key, prefixed(variable.values, units))
+        factor, written = prefixes.setdefault(key, prefixed(variable.values, units))
         changed[name] = (variable.dims, variable.values / factor, {**variable.attrs, "units": written})
     return _assigned(dataset, changed)

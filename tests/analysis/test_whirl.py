@@ -158,7 +158,8 @@ def test_a_shaft_at_rest_has_its_natural_frequencies_twice():
     assert still.whirl_direction.tolist() == [0, 2] * 4
 
 
-@pytest.mark.parametrize("unequal", [False, pytest.param(True, marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("unequal", [False, True])
 def test_gradients_of_an_overhung_disc(unequal):
     """From the characteristic polynomial of whirl.md, (k11 - m w^2)(k22 - I_d w^2 + I_p speed w) = k12^2."""
     case, speed = CASES["overhung_massless"], 600.0
@@ -208,19 +209,18 @@ def random_rotor(rng: np.random.Generator, held: bool = True) -> dict[str, Any]:
     return lists | {name: float(x) for name, x in ends.items()} | {"speed": float(each(0, 4, 1)[0])}
 
 
-@pytest.mark.parametrize("count", [1, pytest.param(120, marks=pytest.mark.full)])
-def test_random_shafts_against_finite_elements_and_the_other_count(count):
+@pytest.mark.full
+def test_random_shafts_against_finite_elements_and_the_other_count():
     """No frequency is missed: finite elements find the same ones. Both counts agree on isotropic supports."""
     rng = np.random.default_rng(5)
-    cases = [random_rotor(rng) for _ in range(count)]
+    cases = [random_rotor(rng) for _ in range(120)]
     isotropic = [{name: x for name, x in case.items() if not name.endswith("_y")} for case in cases]
     shafts = [spinning(case, case["speed"]) for case in isotropic]
     backward = [spinning(case, -case["speed"]) for case in isotropic]
     merged = np.sort(np.concatenate([of_all(search, each)[0][:MODES] for each in (shafts, backward)]), axis=0)[:MODES]
-    if count > 1:
-        coupled, certified, _ = of_all(solve, [shaft._replace(k_y=shaft.k) for shaft in shafts])
-        assert certified.all()
-        np.testing.assert_allclose(coupled, merged, rtol=2e-13)
+    coupled, certified, _ = of_all(solve, [shaft._replace(k_y=shaft.k) for shaft in shafts])
+    assert certified.all()
+    np.testing.assert_allclose(coupled, merged, rtol=2e-13)
     found, certified, codes = of_all(solve, [spinning(case, case["speed"]) for case in cases])
     assert certified.all()
     for lane, case in enumerate(cases):

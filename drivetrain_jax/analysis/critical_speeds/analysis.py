@@ -137,9 +137,9 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
     if request.method == "krylov_determinant":
         for name in (name for name in _ADDITIONS if name in {p.name for p in system.parameters}):
             if fixed.get(name) != system.parameter(name).default:
-                given = f"fixed.{name} = {fixed[name]}" if name in fixed else name
+                written = f"fixed.{name} = {fixed[name]}" if name in fixed else name
                 raise InputError(
-                    f"{given}: not in the equations of krylov_determinant; allowed is the method certified"
+                    f"{written}: not in the equations of krylov_determinant; allowed is the method certified"
                 )
         if 0.0 in np.ravel(fixed.get("rhoA", ())):
             raise InputError("fixed.rhoA: krylov_determinant needs mass in every segment; allowed is rhoA[i] > 0")
@@ -246,12 +246,12 @@ def _derivatives(
     known = [results[name] / unit for name, unit in units.items() if name in results and request.method == "certified"]
     q = jnp.sqrt(known[0]) if known else shaft_roots.find_roots(build(parameters), options["modes"]).q
     slope = frequency_derivatives(build, parameters, q)
-    found = {name: slope * unit for name, unit in units.items()}
+    jacobians = {name: slope * unit for name, unit in units.items()}
     if "separation_margin" in results:
         low, high = options["operating_min"], options["operating_max"]
         margin = jax.vmap(jax.grad(lambda speed: separation_margin(speed, low, high)))
-        found["separation_margin"] = margin(q**2 * units["critical_speed"])[:, None] * found["critical_speed"]
-    return found
+        jacobians["separation_margin"] = margin(q**2 * units["critical_speed"])[:, None] * jacobians["critical_speed"]
+    return jacobians
 
 
 ANALYSIS = Analysis(

@@ -136,8 +136,8 @@ def segments_of(shaft: Shaft, q: Array, faint: bool = False) -> tuple[Segment, L
             rotary = square[axes] * shaft.rhoI / mass[axes]
     before, behind = split_inertia(shaft)
     k_rot, inertia, m = (None if x is None else x[:-1] for x in (shaft.k_rot, behind, shaft.m))
-    own = inner.beta, inner.e1, inner.e2, inner.e3, None if faint else inner.r
-    segments = Segment(*own, shaft.k[:-1], unit[:-1], m, hinges, turn, k_rot, inertia, before, shear, rotary)
+    scaled = inner.beta, inner.e1, inner.e2, inner.e3, None if faint else inner.r
+    segments = Segment(*scaled, shaft.k[:-1], unit[:-1], m, hinges, turn, k_rot, inertia, before, shear, rotary)
     k_rot, inertia, m = (None if x is None else x[-1] for x in (shaft.k_rot, shaft.inertia, shaft.m))
     return segments, LastNode(shaft.k[-1], m, unit[-1], k_rot, inertia, scales.e1[-1], scales.e3[-1])
 

@@ -43,11 +43,11 @@ def _rows(segments: int, hinges: bool) -> tuple[np.ndarray, ...]:
     The unknowns are f and theta at the nodes, the rotations of the joints if there are ``hinges``, and the segments' own.
     """
     nodes, joints = segments + 1, (segments - 1) * hinges
-    f, theta, turned, own = np.split(np.eye(2 * nodes + joints + 2 * segments), np.cumsum([nodes, nodes, joints]))
+    f, theta, turned, inner = np.split(np.eye(2 * nodes + joints + 2 * segments), np.cumsum([nodes, nodes, joints]))
     behind = theta.copy()
     behind[1 : 1 + joints] += turned
     ends = np.stack([f[:-1], behind[:-1], f[1:], theta[1:]], axis=1)
-    return np.concatenate([ends, own.reshape(segments, 2, -1)], axis=1), f, theta, behind
+    return np.concatenate([ends, inner.reshape(segments, 2, -1)], axis=1), f, theta, behind
 
 
 def _one_sense(shaft: Shaft, q: Array, sense: Array, mass: Array) -> tuple[Array, Array]:
@@ -92,12 +92,12 @@ def _matrix(shaft: Shaft, q: Array, masses: Array) -> tuple[Array, Array]:
     """
     senses = jax.vmap(partial(_one_sense, shaft, q))(jnp.array([1.0, -1.0]), masses)
     (forward, backward), counts = senses
-    own, other = (forward + backward) / 2, (forward - backward) / 2
+    same, other = (forward + backward) / 2, (forward - backward) / 2
     rotation = jnp.zeros(shaft.segments + 1) if shaft.k_rot is None else shaft.k_rot
     parts = [rotation / q] + ([] if shaft.k_hinge is None else [shaft.k_hinge / q]) + [jnp.zeros(2 * shaft.segments)]
     springs = jnp.concatenate([shaft.k / q**3, *parts, shaft.k_y / q**3, *parts])
     rigid = jnp.isinf(springs)
-    whole = jnp.block([[own, other], [other, own]]) + jnp.diag(jnp.where(rigid, 0.0, springs))
+    whole = jnp.block([[same, other], [other, same]]) + jnp.diag(jnp.where(rigid, 0.0, springs))
     whole = jnp.where(rigid[:, None] | rigid, jnp.diag(jnp.where(rigid, 1.0, 0.0)), whole)
     scale = jnp.ones(len(whole))
     for _ in range(3):
@@ -111,8 +111,8 @@ def _each(function: Callable[..., Any], shaft: Shaft, q: Array, *more: Array) ->
     flat = jax.tree.map(lambda field: field.reshape(len(field), -1), shaft.spread())
     arrays = [x.reshape(-1, flat.k.shape[1], *x.shape[q.ndim :]) for x in (q, *more)]
     along = jax.vmap(function, in_axes=(1, *(0 for _ in arrays)))
-    found = jax.vmap(along, in_axes=(None, *(0 for _ in arrays)))(flat, *arrays)
-    return jax.tree.map(lambda x: x.reshape(*q.shape, *x.shape[2:]), found)
+    results = jax.vmap(along, in_axes=(None, *(0 for _ in arrays)))(flat, *arrays)
+    return jax.tree.map(lambda x: x.reshape(*q.shape, *x.shape[2:]), results)
 
 
 def characteristic(shaft: Shaft, q: Array) -> Value:

@@ -178,8 +178,8 @@ def _finish(shaft: Shaft, brackets: _Brackets, room: int) -> _Brackets:
         flat, left = state
         # Free places are taken by the first of them once more: the same values, written twice.
         place = jnp.nonzero(left, size=room, fill_value=jnp.argmax(left))[0]
-        own = jax.tree.map(lambda field: field[:, place % lanes], fields)
-        done = _advance(own, place // lanes + 1, COMMON_STEPS, jax.tree.map(lambda x: x[place], flat), MAX_STEPS)
+        chosen = jax.tree.map(lambda field: field[:, place % lanes], fields)
+        done = _advance(chosen, place // lanes + 1, COMMON_STEPS, jax.tree.map(lambda x: x[place], flat), MAX_STEPS)
         return jax.tree.map(lambda x, new: x.at[place].set(new), flat, done), left.at[place].set(False)
 
     flat = jax.tree.map(lambda x: x.reshape(-1), brackets)
@@ -327,7 +327,7 @@ def krylov_roots(shaft: Shaft, modes: int) -> Roots:
     zeros = zero_modes(shaft)
     wanted = index - zeros
     cell = jnp.argmax(number[None] >= wanted[:, None], axis=1)
-    found = (number[-1] >= wanted) & (wanted > 0)
+    crossed = (number[-1] >= wanted) & (wanted > 0)
     low, high = (jnp.take_along_axis(grid, cell + shift, axis=0) for shift in (0, 1))
     sign = jnp.take_along_axis(positive, cell, axis=0)
 
@@ -338,8 +338,8 @@ def krylov_roots(shaft: Shaft, modes: int) -> Roots:
         return jnp.where(same, middle, low), jnp.where(same, high, middle)
 
     low, high = jax.lax.fori_loop(0, _BISECTIONS, halve, (low, high))
-    q = jnp.where(wanted <= 0, 0.0, jnp.where(found, 0.5 * (low + high), jnp.nan))
+    q = jnp.where(wanted <= 0, 0.0, jnp.where(crossed, 0.5 * (low + high), jnp.nan))
     safe = jnp.where(q > 0, q, 1.0)
     below, above = (characteristic(shaft, safe * (1 + shift)).count for shift in (-_APART, _APART))
-    certified = (wanted <= 0) | (found & (below < index) & (above >= index))
+    certified = (wanted <= 0) | (crossed & (below < index) & (above >= index))
     return Roots(q, jnp.where(q > 0, 2 * (high - low) / safe, 0.0), certified)

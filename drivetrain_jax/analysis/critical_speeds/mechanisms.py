@@ -58,15 +58,15 @@ def _slow_modes(shaft: Shaft) -> Array:
     ends, at_ends = _at_ends(shaft)
     free, *second = (_unrestrained(plane, at_ends) for plane in _in_planes(shaft))
     turned = shaft if shaft.spin is None else shaft._replace(spin=-shaft.spin)
-    mass, backward = (_masses(_slow_inertias(each), at_ends, ends) for each in (shaft, turned))
+    mass, backward = (_masses(_slow_inertias(turning), at_ends, ends) for turning in (shaft, turned))
     if second:
         none = jnp.zeros_like(free)
         free = jnp.concatenate([jnp.concatenate([free, none], 1), jnp.concatenate([none, second[0]], 1)])
-        own, other = mass + backward, mass - backward
-        mass = jnp.concatenate([jnp.concatenate([own, other], 1), jnp.concatenate([other, own], 1)])
+        same, other = mass + backward, mass - backward
+        mass = jnp.concatenate([jnp.concatenate([same, other], 1), jnp.concatenate([other, same], 1)])
     matrix = matmul(jnp.swapaxes(free, 0, 1), matmul(mass, free))
     flat = -matrix.reshape(*matrix.shape[:2], -1)
-    return jax.vmap(lambda each: inertia_and_determinant(each)[0], in_axes=-1)(flat).reshape(lanes).astype(int)
+    return jax.vmap(lambda turning: inertia_and_determinant(turning)[0], in_axes=-1)(flat).reshape(lanes).astype(int)
 
 
 def is_undefined(shaft: Shaft) -> Array:
@@ -99,30 +99,30 @@ def _free_motions(shaft: Shaft, held: _Held) -> Array:
     """
     lanes = shaft.lanes
 
-    def hold(flag: Array, dimension: Array, own: Array, other: Array) -> tuple[Array, Array, Array]:
-        moved = flag & ~(own & (dimension == 1))
-        own = jnp.where(moved, dimension == 2, own)
-        return jnp.where(moved, jnp.maximum(dimension - 1, 0), dimension), own, other & ~moved
+    def hold(flag: Array, dimension: Array, first: Array, other: Array) -> tuple[Array, Array, Array]:
+        moved = flag & ~(first & (dimension == 1))
+        first = jnp.where(moved, dimension == 2, first)
+        return jnp.where(moved, jnp.maximum(dimension - 1, 0), dimension), first, other & ~moved
 
     def across(state: tuple[Array, Array, Array], node: tuple[_Held, Array | None]) -> Any:
-        (dimension, found, sliding), (at, free) = state, node
+        (dimension, free_count, sliding), (at, free) = state, node
         turning = jnp.zeros(lanes, bool)
         dimension, sliding, turning = hold(at.before, dimension, sliding, turning)
         if free is not None:
-            found = found + (free & ((dimension == 2) | turning))
+            free_count = free_count + (free & ((dimension == 2) | turning))
             dimension = jnp.where(free & ~turning, jnp.minimum(dimension + 1, 2), dimension)
             turning, sliding = turning | (free & (dimension == 1)), sliding & ~free
             dimension, sliding, turning = hold(at.behind, dimension, sliding, turning)
         dimension, _, sliding = hold(at.deflection, dimension, turning, sliding)
-        return (dimension, found, sliding), None
+        return (dimension, free_count, sliding), None
 
     free = None
     if shaft.k_hinge is not None:
         edge = jnp.zeros((1, *shaft.k_hinge.shape[1:]), bool)
         free = jnp.concatenate([edge, shaft.k_hinge == 0, edge])
     start = jnp.full(lanes, 2), jnp.zeros(lanes, int), jnp.zeros(lanes, bool)
-    (dimension, found, _), _ = jax.lax.scan(across, start, (held, free))
-    return found + dimension
+    (dimension, free_count, _), _ = jax.lax.scan(across, start, (held, free))
+    return free_count + dimension
 
 
 def number_of_modes(shaft: Shaft) -> Array:

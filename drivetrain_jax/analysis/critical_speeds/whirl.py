@@ -102,11 +102,11 @@ def _derivatives(
 
     def within(code: int, sense: float) -> Array:
         """Derivatives of the modes of one sense, at their places; neighbours of the other sense do not count."""
-        own = direction == code
-        place = jnp.argsort(~own, stable=True)
-        others = 2 * jnp.max(q, initial=1.0, where=own) + jnp.arange(len(q))
-        slopes = frequency_derivatives(partial(build, sense), parameters, jnp.where(own, q, others)[place])
-        return jnp.where(own[:, None], slopes[jnp.argsort(place)], 0.0)
+        chosen = direction == code
+        place = jnp.argsort(~chosen, stable=True)
+        others = 2 * jnp.max(q, initial=1.0, where=chosen) + jnp.arange(len(q))
+        slopes = frequency_derivatives(partial(build, sense), parameters, jnp.where(chosen, q, others)[place])
+        return jnp.where(chosen[:, None], slopes[jnp.argsort(place)], 0.0)
 
     still = jnp.where(jnp.isfinite(q) & (q > 0), 0.0, jnp.nan)[:, None]
     return {"whirl_frequency": within(BACKWARD, -1.0) + within(FORWARD, 1.0) + still}
