@@ -50,7 +50,8 @@ def chart(folder):
 
 
 def captions(figure):
-    return " ".join(text.get_text() for text in figure.texts)
+    texts = [*figure.texts, *(legend.get_title() for legend in figure.legends)]
+    return " ".join(text.get_text() for text in texts).replace("\u00a0", " ")
 
 
 @pytest.mark.parametrize(
