@@ -13,7 +13,6 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.view.style import scene_key
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -251,6 +250,9 @@ def write_csv(source: Path, out: Path) -> int:
 
 def _columns(dataset: xr.Dataset) -> Iterator[tuple[str, np.ndarray]]:
     """Header and values, with the shape of all rows, of every column."""
+    # Local import: the style may import xarray first, whose import registers the accessor.
+    from drivetrain_jax.view.style import scene_key
+
     sweep = dataset["outcome"].dims
     sweep = (*sweep, *(dim for dim, size in dataset.sizes.items() if dim not in sweep and size > _MOST_COLUMNS))
     along = [c for c in dataset.coords.values() if c.ndim and set(c.dims) <= set(sweep)]

@@ -325,7 +325,7 @@ class System(eqx.Module):
             value = p.derived or ("none" if p.default == () else p.default)
             default = "required" if value is None else f"default {value}"
             about.append(f"    {p.name}: {p.long_name}; {p.allowed_in_units}; {default}.")
-        cls.__doc__ = "\n".join([cleandoc(body.get("__doc__") or cls.title), "", "Args:", *about])
+        cls.__doc__ = "\n".join([cleandoc(body.get("__doc__") or getattr(cls, "title", "")), "", "Args:", *about])
         if "models" not in body:
             cls.models = dict(cls.models) | {a: m for method in body.values() for a, m in _models(cls, method).items()}
         _check_names(cls)

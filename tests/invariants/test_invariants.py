@@ -93,7 +93,7 @@ def test_the_first_wrong_point_is_named(chart):
         (
             "critical_speeds",
             {"critical_speed": real([[61.0]], "mode"), "natural_frequency": real([[1.0]], "mode")},
-            "critical_speed = 60 natural_frequency",
+            "critical_speed = 60/max(|order|, 1) natural_frequency",
         ),
         ("steady_state", {"u_min": real([1.0]), "u_max": real([0.5])}, "u_min <= u_max"),
         (

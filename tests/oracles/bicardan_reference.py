@@ -13,6 +13,7 @@ system by name.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,6 +24,7 @@ from scipy.optimize import brentq
 
 _LISTS = ("length", "EI", "rhoA", "k_joint", "m_joint", "k_hinge", "kGA", "rhoI", "I_joint")
 Element = tuple[np.ndarray, np.ndarray]
+_OF_WHIRL = re.compile(r"Ip_.*|rhoIp|.*_y|speed")
 
 
 def complete(parameters: Mapping[str, Any]) -> dict[str, Any]:
@@ -30,7 +32,8 @@ def complete(parameters: Mapping[str, Any]) -> dict[str, Any]:
     n = len(parameters["length"])
     defaults = {"k_joint": 0.0, "m_joint": 0.0, "k_hinge": np.inf, "kGA": np.inf, "rhoI": 0.0, "m_A": 0.0, "m_D": 0.0}
     defaults |= {"k_rot_A": 0.0, "k_rot_D": 0.0, "I_A": 0.0, "I_joint": 0.0, "I_D": 0.0}
-    values = {**defaults, **parameters}
+    # Polar inertias and a second plane have no effect on bending in one plane at rest.
+    values = {n: x for n, x in {**defaults, **parameters}.items() if not _OF_WHIRL.fullmatch(n)}
     sizes = dict.fromkeys(("k_joint", "m_joint", "k_hinge", "I_joint"), n - 1)
     return {
         name: np.broadcast_to(np.asarray(value, float), sizes.get(name, n)) if name in _LISTS else float(value)

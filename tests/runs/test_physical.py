@@ -255,7 +255,7 @@ def test_one_diameter_stands_for_all_segments():
     fixed = {name: value for name, value in UNIFORM.items() if name != "outer_diameter"} | {"material": "steel"}
     scene = load_scene({"system": "bicardan", "analysis": "critical_speeds", "axes": axes, "fixed": fixed})
     assert [part.name for part in scene.axes[0].together] == [
-        f"{name}[{i}]" for name in ("EI", "rhoA", "kGA", "rhoI") for i in (0, 1)
+        f"{name}[{i}]" for name in ("EI", "rhoA", "kGA", "rhoI", "rhoIp") for i in (0, 1)
     ]
 
 
