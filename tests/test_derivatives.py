@@ -221,6 +221,7 @@ def entry(system, name):
     but_full(
         CASES,
         "cardan orbit",
+        "planetary modes",
         "cardan forced",
         "tripod floquet",
         "tripod history",

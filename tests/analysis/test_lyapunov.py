@@ -119,6 +119,7 @@ def linear_motions(linear):
     return linear([1.0, 0.2, 0.01, -0.5], [0.09, 1.01, 1.0, 1.0])
 
 
+@pytest.mark.full
 def test_linear_oscillator_under_constant_torque_stands_still(linear_motions):
     np.testing.assert_allclose(linear_motions["lyapunov_spectrum"][:, 0], [-0.1, -0.9], rtol=1e-6)
     assert linear_motions["verdict"][0] == Verdict.FIXED_POINT

@@ -116,6 +116,7 @@ def test_bounds_hold_where_solutions_grow_within_the_period(method, rtol):
     assert found.verdict[-2:].tolist() == [1, 1]
 
 
+@pytest.mark.full
 def test_a_multiplier_below_the_rounding_of_the_matrix_has_its_own_error():
     """x'' = 25 x: of the multipliers exp(+-5 pi) the smaller one is below the rounding, that of x'' = 4 x is not."""
     outputs = ["floquet_multiplier", "floquet_multiplier_error", "spectral_radius"]

@@ -36,6 +36,7 @@ def cells(found, axes, chosen):
     return np.stack([axes[0][i], axes[1][j]], axis=1), {name: value[i, j] for name, value in found.items()}
 
 
+@pytest.mark.full
 def test_first_chart_of_the_theory_page(chart):
     points = random_points(chart, 2000)
     assert chart.atlas.solves == 64 and not chart.atlas.gaps

@@ -192,6 +192,7 @@ def test_many_small_rectangles_are_evaluated_together(deep, monkeypatch):
     assert (abs(slow["spectral_radius"] - alone["spectral_radius"][-200:]) <= error).all()
 
 
+@pytest.mark.full
 def test_arrays_travel_without_what_they_hold(file, expected):
     array = opened(file)["spectral_radius"].variable
     array[:10, :10].values  # noqa: B018

@@ -95,6 +95,7 @@ def test_an_opened_atlas_has_a_flag_for_every_cell(path):
         assert found.proved.dims == ("beta", "Omega") and found.proved.values.all()
 
 
+@pytest.mark.full
 def test_nothing_is_said_to_be_proved_without_a_proof(tmp_path, capsys):
     """Over the stiffness ratio."""
     axes = {"mu": {"start": 0.9, "stop": 1.1}, "Omega": {"start": 1.2, "stop": 1.6}}
