@@ -165,14 +165,14 @@ def _atlas(cells: int) -> Any:
 def evaluation(region: str, setting: Any) -> Job:
     """The grid from an existing atlas."""
     atlas, grid = _atlas(ATLASES[region]), axes(ATLASES[region])
-    return lambda: atlas.grid(**grid)
+    return _compiled(lambda: atlas.grid(**grid))
 
 
 def scattered(region: str, setting: Any) -> Job:
     """Random points from an existing atlas."""
     rng, atlas = np.random.default_rng(2), _atlas(ATLASES[region])
     points = {name: rng.uniform(*ends, _scattered(region)) for name, ends in RANGES.items()}
-    return lambda: atlas(**points)
+    return _compiled(lambda: atlas(**points, proved=False))
 
 
 def _scattered(region: str) -> int:
@@ -184,7 +184,12 @@ def warm(region: str, rtol: float) -> Job:
     import drivetrain_jax as dt
 
     whole = scene(ATLASES[region], "atlas", rtol)
-    return lambda: dt.run(whole)
+    return _compiled(lambda: dt.run(whole))
+
+
+def _compiled(job: Job) -> Job:
+    job()
+    return job
 
 
 def cold(region: str, rtol: float) -> Job:

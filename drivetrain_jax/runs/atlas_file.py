@@ -307,12 +307,12 @@ class StoredAtlas:
         parts = f"{counted(len(atlas.panels), 'panel', 'panels')}, {counted(len(atlas.gaps), 'gap', 'gaps')}"
         return f"{self.scene.system.name} atlas: {ranges}; {fixed}; {parts}"
 
-    def __call__(self, **values: Any) -> xr.Dataset:
+    def __call__(self, *, proved: bool = True, **values: Any) -> xr.Dataset:
         """Results at points: every parameter is a number or an array; they are broadcast against each other.
 
         Arrays of xarray keep their dimensions and labels; others have the dimension ``point`` (or ``dim_0``, ``dim_1``,
-        ...). Raises :class:`InputError` for a missing or unknown name, a value outside the atlas, or shapes or labels that
-        do not match; :class:`ChunkError` if a direct solve in a gap fails.
+        ...). The flags ``proved`` take four fifths of the time. Raises :class:`InputError` for a missing or unknown name, a
+        value outside the atlas, or shapes or labels that do not match; :class:`ChunkError` if a direct solve in a gap fails.
         """
         import xarray as xr
 
@@ -328,7 +328,7 @@ class StoredAtlas:
             name: ((*dims, *inner[name]), v.values.reshape((*shape, *v.shape[1:])), v.attrs)
             for name, v in dataset.data_vars.items()
         }
-        if "verdict" in dataset:
+        if proved and "verdict" in dataset:
             verdict = np.asarray(dataset["verdict"].values)
             data["proved"] = (dims, self.proved(flat, verdict).reshape(shape), PROVED)
         labels = {dim: whole.coords[dim] for dim in dims if dim in whole.coords}
@@ -354,7 +354,7 @@ class StoredAtlas:
                 shown = self.viewed_as(name)[0].name
                 raise InputError(f"{shown}: an array of shape {column.shape}; allowed is a number or a row of numbers")
         if not axes:
-            return self(**given)
+            return self(proved=proved, **given)
         fixed = {name: float(column) for name, column in columns.items() if not column.ndim}
         part = self.slice(fixed)
         dataset = to_dataset(part.scene_on(axes), part.arrays(axes), {})
