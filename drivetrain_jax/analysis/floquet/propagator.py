@@ -352,7 +352,8 @@ def _agreeing(
         z = jax.lax.cond(
             number > 0, lambda: compare(ends, determinant, coarse, fine, len(marches) * count, gain, rtol), lambda: none
         )
-        return number + 1, jnp.where(number == 0, panels, 2 * count), fine, z
+        # The whole ratio: with 5 panels after 2 the bound would be 100 times that of 8 after 2.
+        return number + 1, jnp.where(number == 0, ratio * first, 2 * count), fine, z
 
     first = jnp.maximum(-(-panels // ratio), 1)
     start = _State.start(n, lanes).propagator(first)
