@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 
 # Limits in reference seconds: of one test that is not marked `full`, and of a whole run of `make test` and `make validate`.
-# The unit differs by 20 % between machines: runs of `make test` measured 770 to 935.
-LONGEST, TOTAL = 5.0, {"not full and not docs": 1100.0, "full": 9000.0}
+# The unit differs by 20 % between machines, and by 8 % between runs: one commit measured 963 and 1,044 on one machine.
+LONGEST, TOTAL = 5.0, {"not full and not docs": 1200.0, "full": 9000.0}
 # CPU seconds of `reference` on the machine that the limits refer to: there the tests of d7ff433 took 2,300 s.
 REFERENCE = 0.081
 # Growth that a compilation leaves behind, and resident memory above which compiled code is dropped, in bytes.

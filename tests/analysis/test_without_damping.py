@@ -79,6 +79,7 @@ class Unregistered(dt.Cardan):
         return Mathieu(a=self.Omega, q=self.beta).floquet_model()
 
 
+@pytest.mark.full
 def test_a_class_that_is_not_installed_is_swept(tmp_path):
     shaft = Unregistered(beta=0.5, Omega=2.0, zeta=0.1, alpha=1.0, mu=1.0, gamma=1.0)
     outputs = ["spectral_radius", "verdict", "floquet_multiplier", "floquet_multiplier_error"]

@@ -107,6 +107,7 @@ def test_nothing_is_said_to_be_proved_without_a_proof(tmp_path, capsys):
     assert main(["verify", str(out), "--proof"]) == 2 and "holds no proof" in capsys.readouterr().err
 
 
+@pytest.mark.full
 def test_charts_reports_pages_tips_and_design_say_what_is_proved(path, monkeypatch):
     monkeypatch.setattr(atlas_file, "_TESTED", 30)
     drawn, all_cells = chart(path, {}, 8), "the verdicts of all 16 cells tested are proved; boundaries and tips hold by"
