@@ -21,7 +21,7 @@ from drivetrain_jax.atlas.charts import in_threads
 from drivetrain_jax.atlas.floquet import floquet_domain, middle_of, polynomials_needed, smoothness
 from drivetrain_jax.atlas.panels import Atlas, Panel
 from drivetrain_jax.systems import Enclosure, System
-from drivetrain_jax.systems._models import UNIT, frobenius, rounding
+from drivetrain_jax.systems._smoothness import UNIT, frobenius, rounding
 
 STABLE, UNSTABLE, UNDECIDED = 0, 1, 2
 THEOREM = (

@@ -14,23 +14,19 @@ from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
 from drivetrain_jax.resonances import Family, Resonances
 from drivetrain_jax.systems._base import Conversion, Model, PhysicalData, System, parameter, serves
 from drivetrain_jax.systems._models import (
-    Balance,
     Block,
-    Coordinate,
     DrivenSprings,
-    Enclosure,
     FloquetModel,
     Flow,
     ForcedModel,
     LinearPeriodic,
     PiecewiseLinearOscillator,
-    Series,
     Shaft,
-    Smoothness,
     SpringSystem,
     UnderdampedOscillator,
     dense,
 )
+from drivetrain_jax.systems._smoothness import Balance, Coordinate, Enclosure, Series, Smoothness
 
 _BUILT_IN = {
     "cardan": "Cardan",

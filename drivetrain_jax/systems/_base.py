@@ -36,9 +36,9 @@ from drivetrain_jax.systems._models import (
     ForcedModel,
     PiecewiseLinearOscillator,
     Shaft,
-    Smoothness,
     SpringSystem,
 )
+from drivetrain_jax.systems._smoothness import Smoothness
 
 # Physical data of a system, and the parameters that follow from them: in NumPy, unless data are traced by JAX.
 

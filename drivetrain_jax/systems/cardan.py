@@ -35,18 +35,8 @@ from drivetrain_jax.systems._base import (
     parameter,
     serves,
 )
-from drivetrain_jax.systems._models import (
-    SWAP,
-    Components,
-    Coordinate,
-    FloquetModel,
-    Flow,
-    ForcedModel,
-    LinearPeriodic,
-    Rows,
-    Series,
-    Smoothness,
-)
+from drivetrain_jax.systems._models import SWAP, Components, FloquetModel, Flow, ForcedModel, LinearPeriodic, Rows
+from drivetrain_jax.systems._smoothness import Coordinate, Series, Smoothness
 from drivetrain_jax.systems.bicardan import MATERIALS, ring_power
 from drivetrain_jax.systems.cardan_bounds import BALANCE, ENCLOSURE
 

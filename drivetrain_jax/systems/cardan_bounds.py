@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from drivetrain_jax.systems._models import UNIT, Balance, Columns, Enclosure, frobenius, rounding
+from drivetrain_jax.systems._smoothness import UNIT, Balance, Columns, Enclosure, frobenius, rounding
 
 # Growth and scales of T Phi S, eqs (15)-(16).
 

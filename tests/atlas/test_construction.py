@@ -9,7 +9,7 @@ from drivetrain_jax.atlas import Domain, Function, construct, from_arrays, to_ar
 from drivetrain_jax.atlas.interpolation import evaluate
 from drivetrain_jax.atlas.panels import position
 from drivetrain_jax.systems import Coordinate
-from drivetrain_jax.systems._models import identity
+from drivetrain_jax.systems._smoothness import identity
 
 TOLERANCE = 1e-10
 SQUARE = Domain(("x", "y"), (-1.0, 0.5), (2.0, 3.0), (identity("x"), identity("y")), {})

@@ -1,0 +1,110 @@
+"""Coordinates in which the results of a model are smooth, growth and enclosures: declared by a system for its atlas."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+Function = Callable[[Any], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """A monotone function of one parameter in which polynomials converge fast; NumPy functions of arrays.
+
+    ``forward`` maps the parameter to the coordinate, ``inverse`` maps back, and ``slope`` is the derivative of ``forward``.
+    If ``even``, both signs of the parameter have the same coordinate and results, and ``inverse`` returns the positive sign.
+    """
+
+    name: str
+    forward: Function
+    inverse: Function
+    slope: Function
+    even: bool = False
+
+
+def identity(name: str) -> Coordinate:
+    """The parameter ``name`` itself."""
+    return Coordinate(name, np.asarray, np.asarray, lambda x: np.ones_like(np.asarray(x, float)))
+
+
+@dataclass(frozen=True)
+class Series:
+    """``A(t) = x B(t)`` with the coordinate x of ``parameter``, for the reduced form of a ``FloquetModel``.
+
+    The propagator is then a power series in x whose terms are integrals.
+    """
+
+    parameter: str
+
+
+Columns = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Balance:
+    """Interpolated is ``T Phi S`` with diagonal T and S that keep the multipliers: its entries are of one size, and bounded.
+
+    ``scales(values, middle)`` are the diagonals of T and S, ``(n, ...)`` each, for columns of parameters; ``middle`` holds
+    one value of each parameter, for the whole domain. ``growth(x, middle)`` bounds ``ln |T Phi S|`` (Frobenius norm) for
+    columns ``x`` of the coordinates of all parameters, of which one may be complex.
+    """
+
+    scales: Callable[[Columns, Columns], tuple[np.ndarray, np.ndarray]]
+    growth: Callable[[Columns, Columns], np.ndarray]
+
+
+# Half a unit in the last place of a number between 1 and 2.
+UNIT = 2.0**-53
+
+
+def rounding(n: float) -> float:
+    """Bound of the relative error of ``n`` roundings."""
+    return n * UNIT / (1 - n * UNIT)
+
+
+def frobenius(a: np.ndarray) -> np.ndarray:
+    """Frobenius norms of matrices, ``(..., n, n)``."""
+    return np.sqrt((a * a).sum((-1, -2)))
+
+
+@dataclass(frozen=True)
+class Enclosure:
+    """Propagators ``T Phi S`` of four states with proved bounds of their errors, from which an atlas proves its verdicts.
+
+    ``varying`` are the parameters that an atlas with proofs may vary; its grids are cut along the first one, because points
+    along the others share work.
+
+    ``propagators(axes, fixed, middle)`` returns, for the grid of the coordinates ``axes``, the coordinates of its points
+    ``(N, d)``, bounds of their errors, matrices ``(N, 4, 4)``, and bounds ``(N,)`` of the norms of their errors, infinite
+    where there is none. ``coordinate(name, values)`` returns a coordinate and bounds of its errors.
+    ``log_determinant(columns)`` is log det Z with a relative error of at most 24 units in the last place. It is 0 only
+    without damping, and in a box least at a corner.
+    """
+
+    varying: tuple[str, ...]
+    propagators: Callable[[Columns, Columns, Columns], tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]
+    coordinate: Callable[[str, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    log_determinant: Callable[[Columns], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Smoothness:
+    """Coordinates by parameter in which the results of a model are smooth; a missing parameter is its own coordinate.
+
+    With ``series`` an atlas computes all its nodes along the parameter of the series together. With ``balance`` too, the
+    numbers of its polynomials and the error of leaving out all others are known beforehand; with ``enclosure`` as well, its
+    verdicts are proved.
+    """
+
+    coordinates: Mapping[str, Coordinate]
+    series: Series | None = None
+    balance: Balance | None = None
+    enclosure: Enclosure | None = None
+
+    def coordinate(self, parameter: str) -> Coordinate:
+        """The coordinate of ``parameter``."""
+        return self.coordinates.get(parameter) or identity(parameter)
