@@ -104,8 +104,7 @@ heyoka_chain = cache(HeyokaChain)
 
 def direct(region: str, rtol: float) -> Job:
     """The package."""
-    fixed = {name: value for name, value in CHAIN.items()}
-    return engine_job(columns_scene("driveline", "floquet", _OUTPUTS, {"speed": SPEEDS}, fixed=fixed,
+    return engine_job(columns_scene("driveline", "floquet", _OUTPUTS, {"speed": SPEEDS}, fixed=CHAIN,
                                     options={"method": "direct", "rtol": rtol}))  # fmt: skip
 
 

@@ -91,7 +91,7 @@ def stability_atlas(atlas: Atlas, system: type[System], rtol: float) -> Stabilit
 
 
 def smoothness(system: type[System]) -> Smoothness:
-    """What the system declares for its atlas; empty for a system without one."""
+    """The declarations of the system for its atlas; empty for a system without one."""
     model = system.models.get("atlas")
     return (model and model.smooth) or Smoothness({})
 

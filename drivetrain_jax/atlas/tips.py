@@ -125,7 +125,7 @@ class Tips:
 
     @property
     def proof(self) -> str:
-        """What is certain of the tips, in one sentence."""
+        """The number of certain tips, and of boxes that may hold more, in one sentence."""
         sure = sum(tip.proved for tip in self.tips)
         more = f", and {len(self.tips) - sure} more may be tips" if sure < len(self.tips) else ""
         hidden = (

@@ -83,7 +83,7 @@ def broadcast(values: Mapping[str, Any]) -> tuple[xr.DataArray, ...]:
 # Values along each axis of the stored chart.
 _CELLS = 256
 # Most cells of a chart whose proofs are counted: a cell takes two microseconds.
-_TESTED = 250_000
+_TESTED = 1 << 16
 # Relative error of forced amplitudes, which are compared with a limit.
 _AMPLITUDE = 1e-6
 # Variables of the file: name, dimensions, meaning. Boxes are in the coordinates named by the attribute.

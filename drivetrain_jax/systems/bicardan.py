@@ -14,31 +14,13 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
-from drivetrain_jax._errors import InputError, counted
+from drivetrain_jax._errors import counted
 from drivetrain_jax._quantities import Parameter
 from drivetrain_jax.systems._base import POSITIVE, Conversion, Number, PhysicalData, System, numeric, parameter, serves
 from drivetrain_jax.systems._models import Shaft, entries_of, stack
+from drivetrain_jax.systems._tubes import MATERIALS, ring_power
 
 # Physical data of a bicardanic shaft and the parameters of ``bicardan``, see docs/systems/bicardan.md.
-
-
-# Young's modulus [Pa], shear modulus [Pa], density [kg/m^3] of structural steel, aluminium alloys and Ti-6Al-4V.
-MATERIALS = {
-    "steel": (2.1e11, 2.1e11 / 2.6, 7850.0),
-    "aluminium": (7.0e10, 7.0e10 / 2.66, 2700.0),
-    "titanium": (1.14e11, 1.14e11 / 2.68, 4430.0),
-}
-
-
-def ring_power(outer: Any, inner: Any, power: int) -> Any:
-    """``outer^power - inner^power``; :class:`InputError` unless the bore is smaller."""
-    xp, outside, inside = numeric(outer, inner)
-    # A traced value cannot be checked.
-    if xp is np and np.any(inside >= outside):
-        raise InputError(f"inner_diameter = {inner!r}: allowed is less than outer_diameter = {outer!r}")
-    return outside**power - inside**power
 
 
 def _area(outer: Any, inner: Any) -> Any:
@@ -142,17 +124,10 @@ def check(fixed: Mapping[str, Any]) -> None:
                 )
     mass = entries_of(fixed.get("rhoA", ()), segments, 1.0)
     for name in ("rhoI", "rhoIp"):
-        for i, (mass_of_segment, rotary) in enumerate(
-            zip(mass, entries_of(fixed.get(name, ()), segments), strict=True)
-        ):
+        for i, pair in enumerate(zip(mass, entries_of(fixed.get(name, ()), segments), strict=True)):
             # Traced values are not checked.
-            if (
-                isinstance(mass_of_segment, (int, float))
-                and isinstance(rotary, (int, float))
-                and mass_of_segment == 0
-                and rotary > 0
-            ):
-                raise ValueError(f"{name}[{i}] = {rotary:g}: allowed is 0 for a segment without mass (rhoA[{i}] = 0)")
+            if all(isinstance(x, (int, float)) for x in pair) and pair[0] == 0 < pair[1]:
+                raise ValueError(f"{name}[{i}] = {pair[1]:g}: allowed is 0 for a segment without mass (rhoA[{i}] = 0)")
 
 
 # Stiffnesses [N m2] and masses per length [kg/m] beyond this range may overflow or underflow on the way to frequencies.

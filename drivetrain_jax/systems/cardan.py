@@ -37,7 +37,7 @@ from drivetrain_jax.systems._base import (
 )
 from drivetrain_jax.systems._models import SWAP, Components, FloquetModel, Flow, ForcedModel, LinearPeriodic, Rows
 from drivetrain_jax.systems._smoothness import Coordinate, Series, Smoothness
-from drivetrain_jax.systems.bicardan import MATERIALS, ring_power
+from drivetrain_jax.systems._tubes import TUBES, stiffness_of_tubes
 from drivetrain_jax.systems.cardan_bounds import BALANCE, ENCLOSURE
 
 # Clock of the reduced equations, and predicted numbers of steps in this clock.
@@ -120,31 +120,6 @@ def _entry(position: int, stiffness: tuple[Any, ...]) -> Any:
     if len(stiffness) != 2:
         raise InputError(f"length: got {len(stiffness)} shafts; allowed are two, the driving and the driven one")
     return stiffness[position]
-
-
-_EACH: dict[str, Any] = {"listed": True, "broadcast": True}
-# Tubes as shafts, one entry each.
-TUBES = (
-    Parameter("outer_diameter", "m", "outer diameters of the shafts", usual=10.0, **POSITIVE, **_EACH),
-    Parameter("inner_diameter", "m", "bores of the shafts", default=0.0, usual=10.0, lower=0.0, **_EACH),
-    Parameter("length", "m", "lengths of the shafts", usual=100.0, listed=True, **POSITIVE),
-    Parameter("material", "1", "material of all shafts: G", choices=tuple(MATERIALS)),
-    Parameter("G", "Pa", "shear modulus of the shafts", **POSITIVE, **_EACH),
-)
-
-
-def stiffness_of_tubes(name: str, replaceable: bool = False) -> tuple[Conversion, ...]:
-    """The conversions of ``TUBES`` to the list of stiffnesses ``name``."""
-    return (
-        Conversion("G", ("material",), lambda word: MATERIALS[word][1], "that of the material", optional=True),
-        Conversion(
-            name,
-            ("outer_diameter", "inner_diameter", "length", "G"),
-            lambda outer, inner, length, g: math.pi / 32 * g * ring_power(outer, inner, 4) / length,
-            "pi/32 G (outer_diameter^4 - inner_diameter^4)/length",
-            replaceable=replaceable,
-        ),
-    )
 
 
 PHYSICAL = PhysicalData(

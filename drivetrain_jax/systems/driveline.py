@@ -46,7 +46,8 @@ from drivetrain_jax.systems._models import (
     SpringSystem,
     weighted_factor,
 )
-from drivetrain_jax.systems.cardan import TUBES, speed_ratio, stiffness_of_tubes
+from drivetrain_jax.systems._tubes import TUBES, stiffness_of_tubes
+from drivetrain_jax.systems.cardan import speed_ratio
 
 Components = Sequence[Any]
 # A list is also an array, and each entry a number, an array of lanes, or a text such as "41/11".

@@ -190,9 +190,9 @@ class EqualStepSize(diffrax.ConstantStepSize):
 class Gauss(diffrax.AbstractSolver):
     """Gauss collocation of order 10 for a :class:`LinearTerm`, in one step over the span of its system.
 
-    The step takes ``panels / ratio`` and ``panels`` panels, then twice as many, until the monodromy matrices of two numbers
-    of panels agree to ``rtol``. The state is the matrix of the propagator, or vectors. The solver's state is the
-    :class:`~drivetrain_jax.analysis.floquet.direct.Monodromy` matrix with its error.
+    The step takes ``panels / ratio`` panels, rounded up, then ``ratio`` times as many, then twice as many, until the
+    monodromy matrices of two numbers of panels agree to ``rtol``. The state is the matrix of the propagator, or vectors. The
+    solver's state is the :class:`~drivetrain_jax.analysis.floquet.direct.Monodromy` matrix with its error.
     """
 
     panels: Any
