@@ -31,7 +31,6 @@ from drivetrain_jax.runs.job import Job, Results
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.reuse import (
     NO_REUSE,
-    Damaged,
     NotReusable,
     ReusableResult,
     ReusedPoints,
@@ -231,7 +230,7 @@ class Output:
         sources = [find(self.job, path) for path in paths]
         # Unfinished fresh work is resumed as fresh.
         if not (fresh or self.unfinished.get("fresh")):
-            if isinstance(self._found, Damaged):
+            if isinstance(self._found, NotReusable) and self._found.damage:
                 raise self.refusal
             sources += [self._found] if isinstance(self._found, ReusableResult) and self._found.is_covered else []
         reused = combined(self.job, sources)
@@ -278,8 +277,7 @@ class Output:
     @property
     def obstacle(self) -> str:
         """The present file or folder that a run would replace, in words."""
-        what = self._damage or (self._found.what if isinstance(self._found, Damaged) else "")
-        if what:
+        if what := self._damage or (self._found.damage if isinstance(self._found, NotReusable) else ""):
             return f"a damaged result ({what})"
         stored, what = self.unfinished, "unfinished work" if self.unfinished else "a result"
         if self.unfinished and self.present not in (None, stored.get("replaces")):

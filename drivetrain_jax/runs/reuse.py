@@ -21,7 +21,7 @@ from drivetrain_jax._errors import InputError, clipped, counted
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import misfits, sweep_first
 from drivetrain_jax.runs.axes import Grid, entry_of
-from drivetrain_jax.runs.job import Job, scene_content
+from drivetrain_jax.runs.job import Job, Results, scene_content
 from drivetrain_jax.runs.scene import Scene, is_of_function, restore_scene, result_variables
 from drivetrain_jax.store import checksums, consolidate
 from drivetrain_jax.store.files import digest
@@ -33,18 +33,11 @@ _ROUNDINGS = 4 * np.finfo(float).eps
 
 
 class NotReusable(InputError):
-    """Raised if no point of a result can be reused."""
+    """Raised if no point of a result can be reused; ``damage`` names the damaged variables of the result, if any."""
 
-    def __init__(self, path: Path, why: str, allowed: str) -> None:
+    def __init__(self, path: Path, why: str, allowed: str, damage: str = "") -> None:
         super().__init__(f"reuse = {str(path)!r}: {why}; allowed is {allowed}")
-
-
-class Damaged(NotReusable):
-    """A damaged result; ``what`` names the damaged variables."""
-
-    def __init__(self, path: Path, what: str) -> None:
-        super().__init__(path, f"damaged ({what})", "to restore the file or to compute it again")
-        self.what = what
+        self.damage = damage
 
 
 @dataclass(frozen=True)
@@ -62,7 +55,7 @@ class ReusableResult:
     ours: np.ndarray
     is_covered: bool
 
-    def blocks(self) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+    def blocks(self) -> Iterator[tuple[np.ndarray, Results]]:
         """Yield our points and their results in blocks, so that no result is loaded as a whole."""
         arrays = {name: sweep_first(consolidate.map_variable(self.path, name), self.grid) for name in self.names}
         for start in range(0, self.ours.size, _BLOCK):
@@ -92,11 +85,10 @@ class ReusedPoints:
     @property
     def attrs(self) -> dict[str, str | int]:
         """Attributes of the result that record the reuse."""
-        if not self.sources:
-            return {}
-        return {"reused_points": self.count, "reused_from": " ".join(s.digest for s in self.sources)}
+        sources = " ".join(source.digest for source in self.sources)
+        return {"reused_points": self.count, "reused_from": sources} if sources else {}
 
-    def blocks(self) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+    def blocks(self) -> Iterator[tuple[np.ndarray, Results]]:
         """Yield the reused points and their results in blocks."""
         for source in self.sources:
             yield from source.blocks()
@@ -106,8 +98,7 @@ class ReusedPoints:
         if not self.sources:
             return None
         left = np.ones(size, bool)
-        for source in self.sources:
-            left[source.ours] = False
+        left[np.concatenate([source.ours for source in self.sources])] = False
         return np.flatnonzero(left)
 
 
@@ -116,8 +107,7 @@ NO_REUSE = ReusedPoints()
 
 def combined(job: Job, results: Iterable[ReusableResult]) -> ReusedPoints:
     """The points of ``job`` that these results contain, each from the first result that has it."""
-    free = np.ones(job.grid.size, bool)
-    sources = []
+    free, sources = np.ones(job.grid.size, bool), []
     for source in results:
         keep = free[source.ours]
         free[source.ours] = False
@@ -140,16 +130,15 @@ def find(job: Job, path: Path) -> ReusableResult:
         scene = restore_scene(attrs.get("scene"))
         reasons = differences_of(scene, attrs, job, points=False)
     except InputError as error:
-        raise NotReusable(path, not_valid(error), "a result that differs in its points only") from None
+        reasons, scene = [_not_valid(error)], job.scene
     if reasons:
         raise NotReusable(path, reasons[0], "a result that differs in its points only")
     # The checksums of the new result would hide damage.
-    if wrong := checksums.damaged(path) or misfits(consolidate.layout(path), scene):
-        raise Damaged(path, checksums.named(wrong))
-    if "checksums" not in attrs:
-        raise Damaged(path, "it has no checksums")
+    wrong = checksums.named(checksums.damaged(path) or misfits(consolidate.layout(path), scene))
+    if damage := wrong or ("" if "checksums" in attrs else "it has no checksums"):
+        raise NotReusable(path, f"damaged ({damage})", "to restore the file or to compute it again", damage)
     grid = Grid.of(scene)
-    theirs, ours = _same_points(scene, grid, job.scene, job.grid)
+    theirs, ours = _same_points(scene, grid, job)
     if theirs.size:
         outcome = sweep_first(consolidate.map_variable(path, OUTCOME.name), grid)[grid.place(theirs)]
         kept = ~(outcome == Outcome.LOST).any(axis=tuple(range(1, outcome.ndim)))
@@ -162,113 +151,76 @@ def find(job: Job, path: Path) -> ReusableResult:
     return ReusableResult(path, str(attrs["digest"]), stored, grid, theirs, ours, is_covered)
 
 
-_NOTHING = np.empty(0, np.int64), np.empty(0, np.int64)
+def _same_points(scene: Scene, grid: Grid, job: Job) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of equal points of a scene and of ``job``; none if lines or fixed values differ.
 
-
-def _same_points(theirs: Scene, grid: Grid, ours: Scene, our_grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of equal points of both grids; none if lines or fixed values differ."""
-    axes = {axis.name for axis in (*theirs.axes, *ours.axes)}
-    # Positions are compared by one parameter an axis.
-    several = any(axis.also for axis in (*grid.axes, *our_grid.axes))
-    if several or _line(grid) != _line(our_grid) or _constants(theirs, axes) != _constants(ours, axes):
-        return _NOTHING
-    if grid.zipped and our_grid.zipped:
-        return _same_rows(grid, our_grid)
-    if not grid.zipped:
-        return _within(theirs, grid, ours, our_grid)
-    rows, listed = _within(ours, our_grid, theirs, grid)
-    rows, first = np.unique(rows, return_index=True)
-    return listed[first], rows
-
-
-def _within(scene: Scene, grid: Grid, other: Scene, points: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Points of ``grid``, an outer product, that ``points`` has too: their numbers in both."""
-    axes, columns = ({axis.name: axis.values for axis in one.axes} for one in (grid, points))
-    # Position along each axis for each value of the points; -1 for none.
-    along = {name: _match(_values(scene, axes, name), values) for name, values in columns.items()}
-    constant = {name: _match(axes[name], _values(other, columns, name))[:1] for name in axes.keys() - columns.keys()}
-    if any(place.size == 0 or place[0] < 0 for place in constant.values()):
-        return _NOTHING
-    if points.zipped:
-        chosen = np.flatnonzero(np.min([*along.values()], axis=0) >= 0)
-        index = {name: place[chosen] for name, place in along.items()}
-    else:
-        kept = np.meshgrid(*(np.flatnonzero(place >= 0) for place in along.values()), indexing="ij")
-        chosen = np.ravel_multi_index([k.ravel() for k in kept], points.shape) if kept else np.zeros(1, np.int64)
-        index = {name: place[k.ravel()] for (name, place), k in zip(along.items(), kept, strict=True)}
-    place = [np.broadcast_to({**constant, **index}[axis.name], chosen.shape) for axis in grid.axes]
-    return np.ravel_multi_index(place, grid.shape) if place else np.zeros(chosen.shape, np.int64), chosen
-
-
-def _line(grid: Grid) -> tuple[Any, ...]:
-    """The identity of the path of a grid, empty without one."""
-    return () if grid.path is None else (grid.path.name, grid.path.values.tolist(), grid.path_is_fixed)
-
-
-def _constants(scene: Scene, varied: set[str]) -> dict[str, Any]:
-    """The parameters that the analysis uses, and list entries, unless they are ``varied``."""
-    used, entries = scene.analysis.model(scene.system).parameters, {}
-    for name, value in scene.fixed.items():
-        if isinstance(value, tuple):
-            entries |= {name: len(value)} | {f"{name}[{i}]": entry for i, entry in enumerate(value)}
-        else:
-            entries[name] = value
-    return {name: value for name, value in entries.items() if entry_of(name)[0] in used and name not in varied}
-
-
-def _values(scene: Scene, axes: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:
-    """Values of a parameter, which varies along one of ``axes`` or is fixed; None if the analysis does not use it."""
-    base, entry = entry_of(name)
-    if name in axes:
-        return axes[name]
-    if base not in scene.analysis.model(scene.system).parameters:
-        return None
-    value = scene.fixed.get(base)
-    if entry is not None:
-        value = value[entry] if isinstance(value, tuple) and entry < len(value) else None
-    return np.array([value] if isinstance(value, (int, float)) else [], float)
-
-
-def _match(theirs: np.ndarray | None, ours: np.ndarray | None) -> np.ndarray:
-    """Position among ``theirs`` for each of ``ours`` within the tolerance of an axis, -1 for none.
-
-    A parameter that is not used (None) has any value.
+    Every point gets a key, the position of its values among all values of the parameters that vary in one of both.
     """
-    if theirs is None or ours is None:
-        return np.zeros(1 if ours is None else len(ours), np.int64)
-    if not (theirs.size and ours.size):
-        return np.full(len(ours), -1)
-    order = np.argsort(theirs)
-    rising = theirs[order].astype(float)
-    right = np.clip(np.searchsorted(rising, ours), 0, len(rising) - 1)
-    left = np.maximum(right - 1, 0)
-    nearest = np.where(abs(rising[left] - ours) < abs(rising[right] - ours), left, right)
-    sought, place = np.unique(np.asarray(ours, float), return_inverse=True)
-    extent_of_theirs, other = _extents(rising)[nearest], _extents(sought)[place]
-    # The ends of an axis are exact, its inner values have rounding errors; use the smaller tolerance of the two axes.
-    extent = np.where(
-        (extent_of_theirs > 0) & (other > 0), np.minimum(extent_of_theirs, other), np.maximum(extent_of_theirs, other)
-    )
-    equal = abs(rising[nearest] - ours) <= _ROUNDINGS * (abs(rising[nearest]) + extent)
-    return np.where(equal, order[nearest], -1)
+    scenes, grids = (scene, job.scene), (grid, job.grid)
+    columns = [{axis.name: axis.values for axis in one.axes} for one in grids]
+    fixed = [_constants(one) for one in scenes]
+    names = dict.fromkeys([*columns[0], *columns[1]])
+    lines = [one.path and (one.path.name, one.path.values.tolist(), one.path_is_fixed) for one in grids]
+    path = {one.path.name for one in grids if one.path}
+    constants = [{n: value for n, value in one.items() if n not in names.keys() | path} for one in fixed]
+    # Positions are compared by one parameter an axis.
+    several = any(axis.also for one in grids for axis in one.axes)
+    if several or lines[0] != lines[1] or constants[0] != constants[1]:
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    keys = [np.zeros(one.shape, np.int64) for one in grids]
+    for name in names:
+        # A parameter that an analysis does not use has any value.
+        if not all(entry_of(name)[0] in one.analysis.model(one.system).parameters for one in scenes):
+            continue
+        values = [np.atleast_1d({**f, **c}.get(name, np.nan)) for c, f in zip(columns, fixed, strict=True)]
+        codes = equal_codes(*values)
+        for one, key, code in zip(grids, keys, codes, strict=True):
+            place = next((i for i, axis in enumerate(one.axes) if axis.name == name), None)
+            key *= 1 + max(codes[0].max(), codes[1].max())
+            if place is None or one.zipped:
+                key += code[0] if place is None else code
+            else:
+                key += code.reshape(-1, *[1] * (len(one.axes) - 1 - place))
+    theirs, ours = (key.reshape(-1) for key in keys)
+    order = np.argsort(theirs, kind="stable")
+    place = order[np.searchsorted(theirs, ours, sorter=order).clip(max=theirs.size - 1)]
+    equal = np.flatnonzero(theirs[place] == ours)
+    return place[equal], equal
 
 
-def _extents(rising: np.ndarray) -> np.ndarray:
+def _constants(scene: Scene) -> dict[str, Any]:
+    """The fixed parameters that the analysis uses, and the entries of lists."""
+    used, entries = scene.analysis.model(scene.system).parameters, {}
+    for name in scene.fixed.keys() & set(used):
+        value = scene.fixed[name]
+        entries[name] = len(value) if isinstance(value, tuple) else value
+        entries |= {f"{name}[{i}]": entry for i, entry in enumerate(value)} if isinstance(value, tuple) else {}
+    return entries
+
+
+def equal_codes(*columns: np.ndarray) -> list[np.ndarray]:
+    """Numbers of the values of two columns, the same for values that are equal within the rounding of an axis.
+
+    The ends of an axis are exact, its inner values have rounding errors in proportion to its length.
+    """
+    values, ends = np.concatenate(columns), [len(columns[0])]
+    extents = np.concatenate([_extents(np.asarray(column, float)) for column in columns])
+    order = np.argsort(values, kind="stable")
+    rising, pairs = values[order].astype(float), np.sort([extents[order][1:], extents[order][:-1]], axis=0)
+    # The smaller tolerance of both, or the only one.
+    extent = np.where(pairs[0] > 0, *pairs)
+    differs = ~(np.diff(rising) <= _ROUNDINGS * (abs(rising[1:]) + extent))
+    codes = np.empty(len(values), np.int64)
+    codes[order] = np.concatenate([[0], np.cumsum(differs)])
+    return np.split(codes, ends)
+
+
+def _extents(column: np.ndarray) -> np.ndarray:
     """Length of the even axis on which each value would have its nearest neighbour; 0 for both ends, which are exact."""
+    rising, place = np.unique(column, return_inverse=True)
     gaps = np.diff(rising)
     between = np.minimum(gaps[1:], gaps[:-1]) * len(rising)
-    return np.pad(between, 1)[: len(rising)] if len(rising) > 1 else np.zeros(len(rising))
-
-
-def _same_rows(grid: Grid, other: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of a list of points for each equal row of another list that varies the same parameters."""
-    theirs, ours = ({axis.name: axis.values.tolist() for axis in one.axes} for one in (grid, other))
-    if theirs.keys() != ours.keys():
-        return _NOTHING
-    place = {row: i for i, row in enumerate(zip(*theirs.values(), strict=True))}
-    rows = zip(*(ours[name] for name in theirs), strict=True)
-    pairs = np.array([(place[row], i) for i, row in enumerate(rows) if row in place], np.int64).reshape(-1, 2)
-    return pairs[:, 0], pairs[:, 1]
+    return np.pad(between, 1)[place] if len(rising) > 1 else np.zeros(len(column))
 
 
 def differences(stored: Mapping[str, Any], job: Job) -> list[str]:
@@ -282,14 +234,12 @@ def differences(stored: Mapping[str, Any], job: Job) -> list[str]:
         reason = same if text == job.scene.text else "the function, an option or a fixed value differs"
         return list(_of_code(stored, job)) or [reason]
     try:
-        scene = restore_scene(text)
+        return differences_of(restore_scene(text), stored, job)
     except InputError as error:
-        return [not_valid(error)]
-    return differences_of(scene, stored, job)
+        return [_not_valid(error)]
 
 
-def not_valid(error: InputError) -> str:
-    """The text that the scene of stored work is not valid."""
+def _not_valid(error: InputError) -> str:
     return f"its scene is not valid now ({' '.join(str(error).split())})"
 
 
@@ -298,75 +248,64 @@ def differences_of(scene: Scene, stored: Mapping[str, Any], job: Job, *, points:
 
     Without ``points``, axes and fixed values may differ, and the work may have more results than requested.
     """
-    return [*_of_scenes(scene, job.scene, points), *_of_code(stored, job)]
+    old, new = _entries(scene, points), _entries(job.scene, points)
+    reasons = [
+        f"{key} is {_text(new.get(key))}, was {_text(old.get(key))}"
+        for key in {**new, **old}
+        if old.get(key) != new.get(key)
+    ]
+    missing = [] if points else [name for name in job.scene.request.outputs if name not in scene.request.outputs]
+    return [*reasons, *([f"lacks {', '.join(missing)}"] if missing else []), *_of_code(stored, job)]
+
+
+@dataclass(frozen=True)
+class _Values:
+    """The values of an axis, as text their number and range."""
+
+    values: list[float]
+    continuous: bool
+
+    def __str__(self) -> str:
+        first, last = self.values[0], self.values[-1]
+        if self.continuous:
+            return f"the range from {first:.10g} to {last:.10g}"
+        ends = f"at {first:.10g}" if len(self.values) == 1 else f"from {first:.10g} to {last:.10g}"
+        return f"{counted(len(self.values), 'value', 'values')} {ends}"
+
+
+def _entries(scene: Scene, points: bool) -> dict[str, Any]:
+    """The entries of a scene by dotted name."""
+    content, where = scene_content(scene), "points" if scene.zipped else "axes"
+    entries = {key: content[key] for key in ("system", "analysis", "method")}
+    entries |= {f"options.{name}": value for name, value in sorted(content["options"].items())}
+    if points:
+        shown = [axis.shown for axis in scene.axes]
+        entries |= {"outputs": ", ".join(content["outputs"]), where: ", ".join(axis.name for axis in shown)}
+        entries |= {f"fixed.{name}": value for name, value in sorted(content["fixed"].items())}
+        entries |= {f"{where}.{a.name}": _Values(a.values.tolist(), scene.analysis.continuous) for a in shown}
+    return entries
 
 
 def _of_code(stored: Mapping[str, Any], job: Job) -> Iterator[str]:
-    """Differences of the code, its packages and the machine."""
+    """Differences of the code, its packages and the machine, as far as they were recorded."""
     if stored.get("drivetrain_jax_version") != drivetrain_jax.__version__:
         yield f"drivetrain_jax is {drivetrain_jax.__version__}, was {stored.get('drivetrain_jax_version')}"
-    if stored.get("numerics") != job.numerics:
-        yield from _of_numerics(stored.get("numerics_detail"), job.numerics_detail)
-
-
-def _of_scenes(theirs: Scene, ours: Scene, points: bool) -> Iterator[str]:
-    old, new = scene_content(theirs), scene_content(ours)
-    for key in ("system", "analysis", "method"):
-        if old[key] != new[key]:
-            yield f"{key} is {new[key]}, was {old[key]}"
-    yield from _of_tables("options", old["options"], new["options"])
-    if points:
-        if old["outputs"] != new["outputs"]:
-            yield f"outputs are {', '.join(new['outputs'])}, were {', '.join(old['outputs'])}"
-        yield from _of_tables("fixed", old["fixed"], new["fixed"])
-        yield from _of_axes(theirs, ours)
-    elif missing := [name for name in new["outputs"] if name not in old["outputs"]]:
-        yield f"lacks {', '.join(missing)}"
-
-
-def _of_tables(table: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
-    for name in sorted({*old, *new}):
-        if old.get(name) != new.get(name):
-            yield f"{table}.{name} is {_text(new.get(name))}, was {_text(old.get(name))}"
-
-
-def _of_axes(theirs: Scene, ours: Scene) -> Iterator[str]:
-    old, new = ({axis.shown.name: axis.shown.values for axis in scene.axes} for scene in (theirs, ours))
-    if list(old) != list(new) or theirs.zipped != ours.zipped:
-        kinds = ["points" if scene.zipped else "axes" for scene in (ours, theirs)]
-        yield f"{kinds[0]} are {', '.join(new) or 'none'}, {kinds[1]} were {', '.join(old) or 'none'}"
+    if stored.get("numerics") == job.numerics:
         return
-    for name, values in new.items():
-        if not np.array_equal(values, old[name]):
-            now, before = (_range(row, ours) for row in (values, old[name]))
-            yield f"{'points' if ours.zipped else 'axes'}.{name} has {now}, had {before}"
-
-
-def _range(values: np.ndarray, scene: Scene) -> str:
-    if scene.analysis.continuous:
-        return f"the range from {values[0]:.10g} to {values[-1]:.10g}"
-    ends = f"at {values[0]:.10g}" if len(values) == 1 else f"from {values[0]:.10g} to {values[-1]:.10g}"
-    return f"{counted(len(values), 'value', 'values')} {ends}"
-
-
-def _of_numerics(stored: str | None, present: Mapping[str, Any]) -> list[str]:
-    """Differences of versions, sources and machine, as far as they were recorded."""
     try:
-        old = json.loads(stored or "")
+        old = json.loads(stored.get("numerics_detail") or "")
     except ValueError:
-        return ["the code, a version or the machine differs"]
-    changes = []
-    for key, value in present.items():
-        before = old.get(key)
-        if isinstance(value, Mapping) and isinstance(before, Mapping):
-            changed = [name for name in sorted({*value, *before}) if value.get(name) != before.get(name)]
-            if key == "versions":
-                changes += [f"{name} is {value.get(name)}, was {before.get(name)}" for name in changed]
-            elif changed:
-                changes.append(f"the code has changed in {', '.join(changed[:3])}{', ...' if len(changed) > 3 else ''}")
-        elif value != before:
-            changes.append(f"{key} is {_text(value)}, was {_text(before)}")
-    return changes or ["the code, a version or the machine differs"]
+        old = job.numerics_detail
+    tables = [{**table, **table.get("versions", {})} for table in (old, job.numerics_detail)]
+    sources = [table.pop("sources", {}) for table in tables]
+    changes = [
+        f"{key} is {_text(tables[1].get(key))}, was {_text(tables[0].get(key))}"
+        for key in sorted({**tables[1], **tables[0]})
+        if key != "versions" and tables[0].get(key) != tables[1].get(key)
+    ]
+    if changed := sorted(n for n in {**sources[0], **sources[1]} if sources[0].get(n) != sources[1].get(n)):
+        changes.insert(0, f"the code has changed in {', '.join(changed[:3])}{', ...' if len(changed) > 3 else ''}")
+    yield from changes or ["the code, a version or the machine differs"]
 
 
 def _text(value: Any) -> str:

@@ -185,7 +185,7 @@ def test_status_tells_why_a_run_would_be_refused(cli):
     cli("run", "scene.toml", "--out", "r.nc", "--quiet")
     code, out, _ = cli("status", "scene.toml", "--out", "r.nc", "--set", "fixed.b=3", "--set", "axes.a.num=5")
     assert code == 0 and out.startswith("stale: 0 of 5 points done, 0 without a value\n  a run would stop: ")
-    assert "fixed.b is 3.0, was 2.0; axes.a has 5 values from 0 to 10, had 21 values" in out
+    assert "fixed.b is 3.0, was 2.0; axes.a is 5 values from 0 to 10, was 21 values" in out
     answer = json.loads(cli("status", "scene.toml", "--out", "r.nc", "--set", "fixed.b=3", "--json")[1])
     assert (
         answer["state"] == "stale" and "fixed.b is 3.0, was 2.0" in answer["reason"] and "--fresh" in answer["reason"]

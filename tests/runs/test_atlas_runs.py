@@ -271,7 +271,7 @@ def test_single_points_empty_arrays_and_wrong_shapes(atlas):
 @pytest.mark.full
 def test_an_atlas_of_another_range_is_refused(tmp_path):
     run_to_file(ATLAS, tmp_path / "a.nc")
-    with pytest.raises(dt.InputError, match=r"axes.beta has the range from 0 to 0\.5, had the range from 0 to 0\.6;"):
+    with pytest.raises(dt.InputError, match=r"axes.beta is the range from 0 to 0\.5, was the range from 0 to 0\.6;"):
         run_to_file(ATLAS, tmp_path / "a.nc", overrides={"axes.beta.stop": 0.5})
 
 
