@@ -290,7 +290,10 @@ def _solve(system: type[System], request: Request, values: Mapping[str, Any], ef
         [jnp.broadcast_to(jnp.asarray(s, float), states.shape[2:]) for s in flow.scale or (1.0,) * flow.size]
     )
     finite = jnp.all(jnp.isfinite(states), axis=(0, 1))
-    results["section"] = jnp.where(jnp.isfinite(states), states, jnp.nan) * scale
+    # Angles up to whole turns: a section lies on the cylinder.
+    cyclic = np.isin(np.arange(flow.size), flow.cyclic).reshape(-1, *(1,) * (states.ndim - 2))
+    turned = jnp.where(cyclic, states - 2 * np.pi * jnp.round(states / (2 * np.pi)), states)
+    results["section"] = jnp.where(jnp.isfinite(states), turned, jnp.nan) * scale
     outcome = jnp.where(finite | (outcome == Outcome.STEP_LIMIT), outcome, Outcome.NOT_FINITE).astype(jnp.int8)
     return {name: results[name] for name in request.outputs} | {"outcome": outcome}
 

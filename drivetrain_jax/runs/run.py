@@ -117,7 +117,7 @@ def run_to_file(
     if not fresh and output.state == "stale":
         raise output.refusal
     executor = executor or Threads()
-    executor.check()
+    executor.check(job.problem.system)
     paths = [reuse] if isinstance(reuse, (str, Path)) else reuse
     return _into(output, output.reused_points(paths, fresh), fresh, executor, report)
 

@@ -7,6 +7,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -83,12 +84,16 @@ class Problem:
             return False
 
     def __reduce__(self) -> tuple[Any, ...]:
-        names = {"system": self.system.name, "analysis": self.analysis.name}
+        system = self.system
+        names = {"system": (system.__module__, system.__qualname__, system.name), "analysis": self.analysis.name}
         return _restored, (type(self), {f.name: getattr(self, f.name) for f in fields(self)} | names)
 
 
 def _restored(kind: type[Problem], values: dict[str, Any]) -> Problem:
-    system = find_system(values["system"])
+    module, qualified, name = values["system"]
+    # A worker imports the module of a class that is not installed.
+    own = getattr(import_module(module), qualified, None)
+    system = find_system(name) if own is None else register(own)
     analysis = kind.find_analysis(values["analysis"]).for_system(system)
     return kind(**values | {"system": system, "analysis": analysis})
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
+import sys
 import time
 import uuid
 from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping
@@ -26,6 +28,7 @@ from drivetrain_jax.runs.assemble import BlockStore, ResultBuffer, labelled, sto
 from drivetrain_jax.runs.job import Block, Chunk, Job, Results
 from drivetrain_jax.runs.reuse import NO_REUSE, ReusedPoints
 from drivetrain_jax.store.consolidate import Labelled, ResultFile
+from drivetrain_jax.systems import System
 
 # Tasks per worker: one is computed while the other waits, so no worker idles during writing.
 IN_FLIGHT = 2
@@ -91,8 +94,8 @@ class Threads:
     def __init__(self, count: int | None = None) -> None:
         self._count = count
 
-    def check(self) -> None:
-        """Raise :class:`InputError` if no scheduler answers at the address."""
+    def check(self, system: type[System]) -> None:
+        """Raise :class:`InputError` if no scheduler answers at the address, or its workers cannot import ``system``."""
 
     def run(
         self, job: Job, blocks: Iterable[Block], store: BlockStore | None, first: int, tick: Callable[[int], None]
@@ -196,10 +199,19 @@ class Cluster(Threads):
         self._connection = ExitStack()
         self._client: Any = None
 
-    def check(self) -> None:
-        """Raise :class:`InputError` if no scheduler answers at the address; a local one starts with the first work."""
-        distributed = _distributed()
-        if not _LOCAL.fullmatch(self._address):
+    def check(self, system: type[System]) -> None:
+        """Raise :class:`InputError` if no scheduler answers at the address, or if no worker can import ``system``.
+
+        A local scheduler starts with the first work, and its workers import the script.
+        """
+        distributed, local = _distributed(), _LOCAL.fullmatch(self._address)
+        script = local and os.path.isfile(getattr(sys.modules["__main__"], "__file__", None) or "")
+        if system.__module__ == "__main__" and not script:
+            raise InputError(
+                f"system = {system.name!r}: workers cannot import a class of this session; "
+                "expected a class of a module (a file NAME.py), or a run with threads"
+            )
+        if not local:
             with ExitStack() as stack:
                 _connect(distributed, self._address, stack)
 

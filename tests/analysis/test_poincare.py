@@ -12,6 +12,7 @@ import pytest
 import drivetrain_jax as dt
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.lyapunov.section_measures import chaos_k01, period_multiple, torus_residual
+from drivetrain_jax.systems import Flow, System, serves
 
 FIXED = {"element": "input", "beta": math.radians(9), "zeta": 0.0186, "chi_n": 0.0026}
 # 3000 Hz strobes against a motor torque of 300 Hz close after 10, 3066.5 Hz after 6133.
@@ -59,6 +60,24 @@ def test_few_strobes_that_do_not_repeat_tell_nothing_of_chaos():
     found = [section(["chaos_k01"], strobes=n, discard=800, steps=24).chaos_k01.values for n in (511, 512)]
     np.testing.assert_array_equal(np.isnan(found), [[False, True], [False, False]])
     assert found[0][0] == 0 and abs(found[1][1]) < 0.1
+
+
+def test_the_angle_of_a_section_lies_within_a_turn():
+    """A turning pendulum gains some 90 rad a strobe; the curve of its section is closed on the cylinder."""
+
+    class Turning(System):
+        name = title = "turning"
+
+        @serves("poincare")
+        def flow(self):
+            def field(angles, y):
+                return y[1], 2.0 + 0.5 * jnp.cos(angles[0]) - 0.2 * y[1] - jnp.sin(y[0])
+
+            return Flow(field, (0.1, 0.0), period=2 * math.pi / 0.7, turns=(1,), cyclic=(0,))
+
+    section = dt.poincare(Turning(), strobes=128, discard=20, steps=24).section
+    assert 3.0 < jnp.max(jnp.abs(section[:, 0])) <= math.pi
+    assert jnp.ptp(section[:, 1]) < 0.3
 
 
 @pytest.mark.full

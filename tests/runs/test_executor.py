@@ -17,7 +17,7 @@ import toy
 import xarray as xr
 
 import drivetrain_jax as dt
-from drivetrain_jax import InputError
+from drivetrain_jax import InputError, systems
 from drivetrain_jax._errors import ChunkError
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.runs import toml, work
@@ -167,7 +167,28 @@ def test_wrong_executor_is_one_clear_line(monkeypatch, options, message):
         pytest.importorskip("distributed")
         monkeypatch.setattr(work, "_ANSWERED", 1.0)
     with pytest.raises(InputError, match=message.replace("(", r"\(")):
-        make_executor(**options).check()
+        make_executor(**options).check(dt.Cardan)
+
+
+def test_a_class_of_a_session_is_refused_before_workers_start(monkeypatch):
+    """Workers import the module of a class; that of a notebook has no file."""
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", "<cell>")
+    own = type("Own", (dt.Rattle,), {"name": "own", "__module__": "__main__"})
+    with pytest.raises(InputError, match=r"^system = 'own': workers cannot import a class of this session; expected"):
+        make_executor(workers=1).check(own)
+
+
+def test_a_worker_imports_the_module_of_a_registered_class(grid_scene, monkeypatch):
+    """The class is registered in a worker as it is in the driver."""
+    monkeypatch.setattr("drivetrain_jax.systems._REGISTERED", {})
+    monkeypatch.setattr("drivetrain_jax.systems.system_names", lambda: ("cardan",))
+    own = load_scene(grid_scene).system
+    dt.register(own)
+    sent = pickle.dumps(resolve(load_scene(grid_scene)))
+    systems._REGISTERED.clear()
+    assert pickle.loads(sent).problem.system is own is systems.get_system(own.name)
+    assert own.name in systems._REGISTERED
 
 
 def test_a_worker_of_another_kind_is_refused_before_it_computes(grid_scene, monkeypatch):
