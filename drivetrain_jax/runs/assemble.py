@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,13 +24,13 @@ from drivetrain_jax.runs.scene import Problem, Scene, restore_scene, result_vari
 from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.consolidate import CONVENTIONS, Entry, Labelled, ResultFile, release
 from drivetrain_jax.store.files import command, flush_tree, move_folder, now, versions
-from drivetrain_jax.store.parts import PartsFolder
+from drivetrain_jax.store.parts import Arrays, BlockFiles, PartsFolder
 from drivetrain_jax.systems import System
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from drivetrain_jax.runs.job import Block, Job, Results
+    from drivetrain_jax.runs.job import Block, Job
 
 # Code of points that are not computed yet, which no finished result contains.
 PENDING = len(Outcome)
@@ -43,76 +43,52 @@ class ResultBuffer:
     """Results of all points of a grid, filled block by block.
 
     ``arrays`` holds all values: the axes in scene order (or the points), then the dimensions of the result.
-    ``allocate(template)`` returns such arrays for a labelled result (default: in memory). A point that is never filled is
-    undefined, or has no value and the outcome ``blank``.
+    ``allocate`` returns such arrays for those of :func:`blank` (default: a copy in memory).
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        grid: Grid,
-        allocate: Callable[[Labelled], Mapping[str, np.ndarray]] | None = None,
-        blank: int | None = None,
+        self, scene: Scene, grid: Grid, allocate: Callable[[Arrays], Arrays] = lambda blank: _copied(blank)
     ) -> None:
         self.variables = result_variables(scene)
-        self._scene, self._grid, self._allocate, self._blank = scene, grid, allocate, blank
+        self._scene, self._grid, self._allocate = scene, grid, allocate
         self._unreleased = 0
-        self.arrays: Mapping[str, np.ndarray] = {}
+        self.arrays: Arrays = {}
 
-    def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
+    def fill(self, points: np.ndarray, results: Arrays) -> None:
         """Write the results of ``points``."""
-        self._lay_out_for(results)
-        for variable in self.variables:
-            values = results[variable.name]
+        grid = self._grid
+        for name, array in self.lay_out(results).items():
             # A fixed path parameter is not a dimension of the result.
-            enter(self.arrays[variable.name], self._grid, points, values[:, 0] if self._grid.path_is_fixed else values)
+            values = results[name][:, 0] if grid.path_is_fixed else results[name]
+            if grid.path_position is None:
+                array.reshape(grid.size, *array.shape[len(grid.shape) :])[points] = values
+            else:
+                sweep_first(array, grid)[grid.place(points)] = values
         self.release_after(results)
 
-    def block(self, place: tuple[slice, ...], like: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def block(self, place: tuple[slice, ...], like: Arrays) -> dict[str, np.ndarray]:
         """Views of the arrays at a block of the grid, or a range of the points, to be overwritten.
 
         ``like`` holds the results of one point.
         """
-        self._lay_out_for(like)
-        return {name: values[place] for name, values in self.arrays.items()}
+        return {name: values[place] for name, values in self.lay_out(like).items()}
 
-    def release_after(self, results: Mapping[str, np.ndarray]) -> None:
+    def release_after(self, results: Arrays) -> None:
         """Periodically release pages of the memory map."""
         self._unreleased += sum(values.nbytes for values in results.values())
         if self._unreleased >= _RESIDENT:
             self._unreleased = 0
             release(self.arrays.values())
 
-    def _lay_out_for(self, results: Mapping[str, np.ndarray]) -> None:
-        """Create the arrays; the first results give the lengths of dimensions that depend on the system."""
+    def lay_out(self, like: Arrays | None = None) -> Arrays:
+        """The arrays. Results ``like`` those that fill them give the lengths of dimensions that depend on the system."""
         if not self.arrays:
-            sizes = {d.name: len(d.values) for d in self._scene.dimensions}
-            for variable in self.variables:
-                sizes |= zip(reversed(variable.dims), reversed(results[variable.name].shape), strict=False)
-            self._create(sizes)
-
-    def lay_out(self) -> Mapping[str, np.ndarray]:
-        """The arrays, which are created if nothing has been filled."""
-        if not self.arrays:
-            self._create(dimension_sizes(self._scene, self._grid))
+            self.arrays = self._allocate(blank(self._scene, self._grid, like))
         return self.arrays
 
-    def _create(self, sizes: Mapping[str, int]) -> None:
-        if self._allocate is None:
-            shapes = {v: (*self._grid.result_shape, *(sizes[dim] for dim in v.dims)) for v in self.variables}
-            self.arrays = {v.name: np.empty(shape, v.dtype) for v, shape in shapes.items()}
-        else:
-            self.arrays = self._allocate(template(self._scene, self._grid, {}, sizes))
-        for variable in self.variables if self._blank is not None else ():
-            self.arrays[variable.name][...] = self._blank if variable.name == OUTCOME.name else variable.missing
 
-
-def enter(array: np.ndarray, grid: Grid, points: np.ndarray, values: np.ndarray | int) -> None:
-    """Write ``values`` of ``points`` into the ``array`` of a result."""
-    if grid.path_position is None:
-        array.reshape(grid.size, *array.shape[len(grid.shape) :])[points] = values
-    else:
-        sweep_first(array, grid)[grid.place(points)] = values
+def _copied(arrays: Arrays) -> Arrays:
+    return {name: np.array(values) for name, values in arrays.items()}
 
 
 def sweep_first(array: np.ndarray, grid: Grid) -> np.ndarray:
@@ -137,17 +113,29 @@ def misfits(layout: Mapping[str, tuple[Any, tuple[int, ...]]], scene: Scene) -> 
     return [v.name for v in (() if scene.analysis.continuous else result_variables(scene)) if not fits(v)]
 
 
-def dimension_sizes(scene: Problem, grid: Grid) -> dict[str, int]:
-    """Lengths of the dimensions of the results besides those of the sweep, those that depend on the system included."""
+def dimension_sizes(scene: Problem, grid: Grid, like: Arrays | None = None) -> dict[str, int]:
+    """Lengths of the dimensions of the results besides those of the sweep.
+
+    Those that depend on the system are those of the results ``like``, or found by tracing.
+    """
     sizes, variables = {d.name: len(d.values) for d in scene.dimensions}, result_variables(scene)
     if not all(sizes[dim] for variable in variables for dim in variable.dims):
         # Local import: `kernel` imports jax and this module.
         from drivetrain_jax.runs.kernel import result_shapes
 
-        shapes = result_shapes(scene, grid, scene.solvers[0])
+        shapes = {n: x.shape for n, x in like.items()} if like else result_shapes(scene, grid, scene.solvers[0])
         for variable in variables:
             sizes |= zip(reversed(variable.dims), reversed(shapes[variable.name]), strict=False)
     return sizes
+
+
+def blank(scene: Problem, grid: Grid, like: Arrays | None = None) -> Arrays:
+    """Results of which none is computed, as arrays that take no memory; see :func:`dimension_sizes` for ``like``."""
+    sizes, arrays = dimension_sizes(scene, grid, like), {}
+    for v in result_variables(scene):
+        value = np.array(PENDING if v.name == OUTCOME.name else v.missing, v.dtype)
+        arrays[v.name] = np.broadcast_to(value, (*grid.result_shape, *(sizes[dim] for dim in v.dims)))
+    return arrays
 
 
 def labelled(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str, str | float]) -> Labelled:
@@ -159,17 +147,6 @@ def labelled(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str,
     )
 
 
-def template(
-    scene: Scene, grid: Grid, attrs: Mapping[str, str | float], sizes: Mapping[str, int] | None = None
-) -> Labelled:
-    """The labelled result with zeros, which take no memory, for its data."""
-    sizes, zeros = dimension_sizes(scene, grid) if sizes is None else sizes, {}
-    for v in result_variables(scene):
-        shape = (*grid.result_shape, *(sizes[dim] for dim in v.dims))
-        zeros[v.name] = np.broadcast_to(np.zeros((), v.dtype), shape)
-    return labelled(scene, zeros, attrs)
-
-
 def with_pending(result: Labelled) -> Labelled:
     """``result`` with the meaning of the code ``PENDING`` added."""
     outcome = result.data[OUTCOME.name]
@@ -179,7 +156,7 @@ def with_pending(result: Labelled) -> Labelled:
     return replace(result, data={**result.data, OUTCOME.name: entry})
 
 
-def to_dataset(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str, str | float]) -> xr.Dataset:
+def to_dataset(scene: Scene, arrays: Arrays, attrs: Mapping[str, str | float]) -> xr.Dataset:
     """The labelled result as a Dataset."""
     return labelled(scene, arrays, attrs).to_dataset()
 
@@ -259,29 +236,9 @@ def result_attrs(scene: Scene) -> dict[str, str]:
     }
 
 
-class BlockStore(Protocol):
-    """Keeps the results of blocks, points first; every worker that computes blocks must see ``place``."""
-
-    @property
-    def place(self) -> str:
-        """Absolute path of the store."""
-        ...
-
-    def numbers(self) -> list[int]:
-        """Numbers of the stored blocks, damaged ones included."""
-        ...
-
-    def write(self, number: int, results: Results) -> None:
-        """Store the results of a block."""
-
-    def read(self, number: int) -> Results | None:
-        """The results of a block; None if it is missing or damaged."""
-        ...
-
-
 def stored_blocks(
     store: BlockStore, job: Job, points: np.ndarray | None = None, first: int = 0, without: Container[int] = ()
-) -> Iterator[tuple[Block, Results]]:
+) -> Iterator[tuple[Block, Arrays]]:
     """Yield the intact blocks of ``job``, or of some of its ``points``, ``without`` these numbers.
 
     Numbers in the store start at ``first``. A block that does not fit the job counts as damaged.
@@ -314,21 +271,20 @@ class ZarrBlocks:
         """Create the store; renew all but the shards of one that a stopped run has left, whose metadata may be damaged."""
         path, half = Path(self.place), Path(self.place).with_name("half")
         shutil.rmtree(half, ignore_errors=True)
-        fills = {v.name: missing_value(v) for v in result_variables(self.job.scene)} | {OUTCOME.name: PENDING}
-        zarr_store.create(half, with_pending(self.template), self.job.boxes, fills)
+        zarr_store.create(half, with_pending(self.template), self.job.boxes)
         shutil.copytree(half, path, dirs_exist_ok=True)
         shutil.rmtree(half)
 
     @property
     def template(self) -> Labelled:
         """The result without its data."""
-        return template(self.job.scene, self.job.grid, self.job.attrs)
+        return labelled(self.job.scene, blank(self.job.scene, self.job.grid), self.job.attrs)
 
     def numbers(self) -> list[int]:
         """Numbers of the shards that are marked done."""
         return np.flatnonzero(zarr_store.done(Path(self.place))).tolist() if os.path.isdir(self.place) else []
 
-    def write(self, number: int, results: Results) -> None:
+    def write(self, number: int, results: Arrays) -> None:
         """Write a shard and mark it done."""
         grid, box = self.job.grid, self.job.boxes.place(number)
         position, arrays = grid.path_position, {}
@@ -340,7 +296,7 @@ class ZarrBlocks:
             arrays[name] = rows if position is None else np.moveaxis(rows, len(sizes), position)
         zarr_store.write(Path(self.place), box, arrays, number)
 
-    def read(self, number: int) -> Results | None:
+    def read(self, number: int) -> Arrays | None:
         """The results of a shard."""
         grid, shard = self.job.grid, zarr_store.read(Path(self.place), self.job.boxes, number)
         if shard is None:
@@ -367,6 +323,9 @@ class ZarrBlocks:
         move_folder(path, parts.out)
 
 
+BlockStore = BlockFiles | ZarrBlocks
+
+
 def export(store: Path, out: Path) -> int:
     """Write the result in the Zarr ``store`` to the new file ``out``, shard by shard; returns the number of points.
 
@@ -384,7 +343,7 @@ def export(store: Path, out: Path) -> int:
     attrs, layout, shards = zarr_store.attributes(store), zarr_store.layout(store), zarr_store.shards_of(store)
     scene = restore_scene(attrs["scene"])
     kept = {name: value for name, value in attrs.items() if name not in (zarr_store.SEAL, "coordinates")}
-    zeros = {v.name: np.broadcast_to(np.zeros((), v.dtype), layout[v.name][1]) for v in result_variables(scene)}
+    zeros = {name: np.broadcast_to(np.zeros((), kind), shape) for name, (kind, shape) in layout.items()}
     try:
         with ResultFile(out.with_name(f"{out.name}.{os.getpid()}.tmp")) as file:
             arrays = file.lay_out(labelled(scene, zeros, kept))

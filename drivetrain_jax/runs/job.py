@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,12 +19,12 @@ from drivetrain_jax import _programs
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax._machine import in_double_precision, threads, usable_cores, use_double_precision
 from drivetrain_jax.analysis import Solver
-from drivetrain_jax.runs.assemble import dimension_sizes, missing_value
+from drivetrain_jax.runs.assemble import blank, missing_value
 from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.kernel import FEW, LIGHT, Kernel, for_device, kernel_of
 from drivetrain_jax.runs.scene import Problem, Scene, result_variables
 from drivetrain_jax.store.files import digest
-from drivetrain_jax.store.parts import Shards
+from drivetrain_jax.store.parts import Arrays, Shards
 
 if TYPE_CHECKING:
     from drivetrain_jax.runs.work import Route
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 # Most kernels that are compiled in parallel.
 _SIDE_BY_SIDE = 8
 
-Results = Mapping[str, np.ndarray]
+Results = Arrays
 
 
 @dataclass(frozen=True)
@@ -198,8 +198,8 @@ class Job:
     @property
     def _shapes(self) -> dict[str, tuple[int, ...]]:
         """Shapes of the results of a point or line, without computing one."""
-        sizes, line = dimension_sizes(self.problem, self.grid), (self.grid.path_length,) * (self.grid.path is not None)
-        return {v.name: (*line, *(sizes[dim] for dim in v.dims)) for v in result_variables(self.problem)}
+        line, outer = (self.grid.path_length,) * (self.grid.path is not None), len(self.grid.result_shape)
+        return {n: (*line, *x.shape[outer:]) for n, x in blank(self.problem, self.grid).items()}
 
 
 def _restored(problem: Problem, route: Route, full_size: bool, boxes: Shards) -> Job:

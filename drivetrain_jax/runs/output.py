@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -18,7 +17,6 @@ import drivetrain_jax
 from drivetrain_jax._errors import InputError, did_you_mean
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import (
-    PENDING,
     BlockStore,
     ResultBuffer,
     ZarrBlocks,
@@ -57,62 +55,57 @@ _FOREIGN = {".csv", ".html", ".json", ".mat", ".npy", ".npz", ".pdf", ".png", ".
 class Output:
     """The result ``out`` and the folder of its parts, compared with the scene of ``job``.
 
-    ``store`` is ``hdf5`` or ``zarr``; default: the form of what is present. ``state`` is ``absent``, ``partial``,
-    ``complete`` or ``stale`` (a result or parts of another scene or version). Raises :class:`InputError` if nothing can be
-    written there, or if what is there is not a result of this package.
+    ``store`` is ``hdf5`` or ``zarr``; default: the form of what is present. ``present`` is the digest of the present result,
+    None without one, empty if the metadata of a store are damaged. Raises :class:`InputError` if nothing can be written
+    there, or if what is there is not a result of this package.
     """
 
     def __init__(self, out: Path, job: Job, store: str | None = None) -> None:
         self.out, self.job = behind_link(out.expanduser()), job
         self.parts = PartsFolder(self.out)
-        self._check_folders()
+        self._check_path()
         # The plan of unfinished work; empty without any.
         self.unfinished = self.parts.plan()
         is_store = zarr_store.is_store(self.out)
         self.store = store or (ZARR if is_store else self.unfinished.get("store", HDF5))
+        self._files: Any = zarr_store if self.store == ZARR else consolidate
         if self.out.is_dir() and not (is_store and self.store == ZARR):
-            raise self._error("is a folder; allowed is the path of a file")
+            raise self.error("is a folder; allowed is the path of a file")
         if self.out.exists() and not self.out.is_dir() and not (self.out.is_file() and self.store == HDF5):
             what = "is a file; allowed for store = 'zarr' is a new path, or such a store"
-            raise self._error(what if self.store == ZARR else "not a regular file; allowed is the path of a file")
+            raise self.error(what if self.store == ZARR else "not a regular file; allowed is the path of a file")
         self.present = self._digest()
 
-    def _error(self, text: str) -> InputError:
+    def error(self, text: str) -> InputError:
+        """An error about the output."""
         return InputError(f"out = {str(self.out)!r}: {text}")
 
-    def _check_folders(self) -> None:
+    def _check_path(self) -> None:
         folder, parts, ending = self.out.parent, self.parts.path, self.out.suffix.lower()
         guess = did_you_mean(ending, (".zarr",)) if ending != ".zarr" else ""
         if guess or ending in _FOREIGN:
-            raise self._error(f"a result is netCDF or Zarr; allowed is a name that ends in .nc or .zarr{guess}")
+            raise self.error(f"a result is netCDF or Zarr; allowed is a name that ends in .nc or .zarr{guess}")
         try:
             if not folder.is_dir():
-                raise self._error(f"the folder {str(folder)!r} does not exist; allowed is a file in an existing folder")
+                raise self.error(f"the folder {str(folder)!r} does not exist; allowed is a file in an existing folder")
             if parts.exists() and not (parts.is_dir() and os.access(parts, os.R_OK | os.X_OK)):
-                raise self._error(f"{str(parts)!r} is no readable folder; allowed is to move it away")
+                raise self.error(f"{str(parts)!r} is no readable folder; allowed is to move it away")
         except OSError as error:
-            raise self._error(f"{error.strerror} (with '.parts'); allowed is a shorter name") from None
+            raise self.error(f"{error.strerror} (with '.parts'); allowed is a shorter name") from None
 
     def _digest(self) -> str | None:
-        """Digest of the present result; None without one, empty if the metadata of a store are damaged."""
         if not self.out.exists():
             return None
         allowed = "allowed is a new file or a result of drivetrain_jax"
         try:
-            digest = self.attribute("digest")
+            digest = self._files.read_attribute(self.out, "digest")
         except InputError:
             if self.store == HDF5:
-                raise self._error(f"not a readable netCDF4/HDF5 file; {allowed}") from None
+                raise self.error(f"not a readable netCDF4/HDF5 file; {allowed}") from None
             return ""
         if not isinstance(digest, str):
-            raise self._error(f"not a result of drivetrain_jax; {allowed}")
+            raise self.error(f"not a result of drivetrain_jax; {allowed}")
         return digest
-
-    def attribute(self, name: str) -> Any:
-        """A global attribute of the present result."""
-        if self.store == ZARR:
-            return zarr_store.attributes(self.out).get(name)
-        return consolidate.read_attribute(self.out, name)
 
     def discard(self) -> None:
         """Delete the remains of the run that made the present result, if it was killed before it could delete them.
@@ -128,14 +121,12 @@ class Output:
 
     @cached_property
     def state(self) -> str:
-        """``absent``, ``partial``, ``complete`` or ``stale``."""
+        """``absent``, ``partial``, ``complete`` or ``stale`` (a result or parts of another scene or version)."""
         if self.present == self.job.digest:
             return "stale" if self._damage else "complete"
-        if self.unfinished:
-            return "partial" if self._continues else "stale"
-        if self.present is None:
+        if self.present is None and not self.unfinished:
             return "absent"
-        return "partial" if self._grows else "stale"
+        return "partial" if (self._continues if self.unfinished else self._grows) else "stale"
 
     @property
     def _continues(self) -> bool:
@@ -147,25 +138,22 @@ class Output:
         return same and (self.present is None or self._replaces_present)
 
     @property
-    def _replaces_present(self) -> bool:
-        """True if the unfinished work began beside the result that is present, not one of the same scene before it."""
-        return (self.unfinished.get("replaces"), self.unfinished.get("replaces_written")) == (
-            self.present,
-            self._written,
-        )
+    def _replaced(self) -> dict[str, Any]:
+        """The present result and the time at which it was written, by the clock of its file system."""
+        file = self.out / "zarr.json" if self.out.is_dir() else self.out
+        written = file.stat().st_mtime_ns if file.exists() else None
+        return {"replaces": self.present, "replaces_written": written}
 
     @property
-    def _written(self) -> int | None:
-        """Time at which the present result was written, by the clock of its file system."""
-        file = self.out / "zarr.json" if self.out.is_dir() else self.out
-        return file.stat().st_mtime_ns if file.exists() else None
+    def _replaces_present(self) -> bool:
+        """True if the unfinished work began beside the result that is present, not one of the same scene before it."""
+        return all(self.unfinished.get(key) == value for key, value in self._replaced.items())
 
     def plan(self, reused: ReusedPoints = NO_REUSE, fresh: bool = False) -> dict[str, Any]:
         """The digest of new parts, and the entries that a reader needs to interpret them."""
         return {
             "digest": self.job.digest,
-            "replaces": self.present,
-            "replaces_written": self._written,
+            **self._replaced,
             "store": self.store,
             "fresh": fresh,
             "reuses": reused.digest,
@@ -180,25 +168,20 @@ class Output:
         """True if a run resumes the present parts. A ``fresh`` run resumes only parts of a fresh run."""
         if not fresh:
             return bool(self.unfinished)
-        same = (self.unfinished.get("fresh"), self.unfinished.get("reuses")) == (True, reused.digest)
-        return self._continues and same
+        return self._continues and bool(self.unfinished["fresh"]) and self.unfinished["reuses"] == reused.digest
 
     def check_unchanged(self) -> None:
         """Raise :class:`InputError` if another run has finished or started since this object was created."""
         if (self._digest(), self.parts.plan()) != (self.present, self.unfinished):
-            raise self._error("another run has changed it; run the command again")
+            raise self.error("another run has changed it; run the command again")
 
     @cached_property
     def _damage(self) -> str:
         """The damaged parts of the present result of this scene, or of one whose digest is damaged; empty without damage."""
         if self.present not in (self.job.digest, ""):
             return ""
-        if self.store == ZARR:
-            return zarr_store.damage(self.out) or ", ".join(misfits(zarr_store.layout(self.out), self.job.scene))
-        changed = checksums.damaged(self.out)
-        if changed == []:
-            changed = misfits(consolidate.layout(self.out), self.job.scene)
-        return "its checksums are gone" if changed is None else checksums.named(changed)
+        damage = self._files.damage(self.out)
+        return damage or checksums.named(misfits(self._files.layout(self.out), self.job.scene))
 
     @cached_property
     def _found(self) -> ReusableResult | NotReusable | None:
@@ -231,7 +214,7 @@ class Output:
         # Unfinished fresh work is resumed as fresh.
         if not (fresh or self.unfinished.get("fresh")):
             if isinstance(self._found, NotReusable) and self._found.damage:
-                raise self.refusal
+                raise self.error(self.reason)
             sources += [self._found] if isinstance(self._found, ReusableResult) and self._found.is_covered else []
         reused = combined(self.job, sources)
         if not fresh and self.unfinished and self.unfinished.get("reuses") != reused.digest:
@@ -259,11 +242,6 @@ class Output:
             yield self.job.points(block), results
 
     @property
-    def refusal(self) -> InputError:
-        """The message of a run that may not replace the present result."""
-        return self._error(self.reason)
-
-    @property
     def reason(self) -> str:
         """The reason why a run stops, and the remedy."""
         remedy = "--fresh replaces it (fresh=True in Python)"
@@ -286,7 +264,7 @@ class Output:
             return f"{what} of --store {stored.get('store')}"
         if not stored:
             names = ("scene", "drivetrain_jax_version", "numerics", "numerics_detail")
-            stored = {name: self.attribute(name) for name in names}
+            stored = {name: self._files.read_attribute(self.out, name) for name in names}
         reasons = differences(stored, self.job)
         more = f" and {len(reasons) - 2} more" if len(reasons) > 2 else ""
         return f"{what} of another scene or version: {'; '.join(reasons[:2]) or 'other sizes of chunks'}{more}"
@@ -295,11 +273,10 @@ class Output:
         """Number of points of the complete result, and their outcomes; of an atlas its solves, which have no outcomes."""
         if self.job.scene.analysis.continuous:
             try:
-                return int(self.attribute("solves")), np.empty(0, OUTCOME.dtype)
+                return int(self._files.read_attribute(self.out, "solves")), np.empty(0, OUTCOME.dtype)
             except (TypeError, ValueError):
-                raise self._error("no atlas has these attributes; --fresh replaces it") from None
-        read = zarr_store.read_variable if self.store == ZARR else consolidate.map_variable
-        return self.job.total, read(self.out, OUTCOME.name)
+                raise self.error("no atlas has these attributes; --fresh replaces it") from None
+        return self.job.total, self._files.map_variable(self.out, OUTCOME.name)
 
 
 @dataclass(frozen=True)
@@ -329,9 +306,9 @@ class Status:
 
     def to_json(self) -> str:
         """The counts, the state and the reason as one JSON object."""
-        content = {name: getattr(self, name) for name in ("total", "done", "failed", "state")}
-        more = {"failed_by_outcome": dict(self.failed_by_outcome), "inaccurate": self.inaccurate, "reason": self.reason}
-        return json.dumps(content | {name: value for name, value in more.items() if value})
+        counts = ("total", "done", "failed")
+        content = {name: x for name, x in vars(self).items() if name in counts or (x and name != "remedy")}
+        return json.dumps(content)
 
 
 def status(
@@ -342,26 +319,23 @@ def status(
     output, total = Output(Path(out), job), 0 if job.scene.analysis.continuous else job.total
     if output.state == "stale":
         return Status(total, 0, 0, "stale", reason=f"it {output.reason}")
-    done, outcomes_of_parts = None, []
+    done, outcomes = None, []
     try:
         if output.state == "complete":
-            done, outcomes = output.counted()
-            outcomes_of_parts = [outcomes]
+            done, codes = output.counted()
+            outcomes.append(codes)
         elif output.state == "partial" and job.scene.analysis.continuous:
             stored = map(output.blocks.read, output.blocks.numbers())
-            outcomes_of_parts = [results[OUTCOME.name] for results in stored if results is not None]
+            outcomes += [results[OUTCOME.name] for results in stored if results is not None]
         elif output.state == "partial" and job.route.is_pointwise:
             # A run through an atlas has no points before its end.
-            outcomes_of_parts = [results[OUTCOME.name] for _, results in output.finished()]
+            outcomes += [results[OUTCOME.name] for _, results in output.finished()]
     except InputError as error:
         return Status(total, 0, 0, "stale", reason=str(error))
-    numbers, counts = np.unique(
-        np.concatenate([np.empty(0, np.int8), *map(np.ravel, outcomes_of_parts)]), return_counts=True
-    )
-    codes = Counter(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
-    done = codes.total() if done is None else done
-    without = {o.name.lower(): codes[o] for o in Outcome if not o.has_value and codes[o]}
-    failed, inaccurate = sum(without.values()), codes[Outcome.TOLERANCE_NOT_MET]
+    done = sum(codes.size for codes in outcomes) if done is None else done
+    counts = {o: sum(int(np.count_nonzero(codes == o)) for codes in outcomes) for o in Outcome}
+    without = {o.name.lower(): count for o, count in counts.items() if count and not o.has_value}
+    failed, inaccurate = sum(without.values()), counts[Outcome.TOLERANCE_NOT_MET]
     remedy = job.scene.analysis.remedy(job.scene.request)
     return Status(total or done, done, failed, output.state, without, remedy=remedy, inaccurate=inaccurate)
 
@@ -391,7 +365,7 @@ def open_result(path: str | Path) -> xr.Dataset:
         raise InputError(
             f"file = {str(path)!r}: an atlas that is not finished; allowed is to wait for it or to resume it"
         )
-    buffer, count = ResultBuffer(job.scene, job.grid, blank=PENDING), 0
+    buffer, count = ResultBuffer(job.scene, job.grid), 0
     for points, results in output.finished():
         buffer.fill(points, results)
         count += results[OUTCOME.name].size

@@ -476,7 +476,9 @@ class Route:
     ) -> None:
         """Write the result from the points ``reused``, the stored blocks, and newly computed ones."""
         with ResultFile(temporary) as file:
-            buffer = ResultBuffer(job.scene, job.grid, lambda blank: file.lay_out(blank.with_attrs(**job.attrs)))
+            buffer = ResultBuffer(
+                job.scene, job.grid, lambda blank: file.lay_out(labelled(job.scene, blank, job.attrs))
+            )
             extra = self.fill(job, buffer, work, progress, reused)
             buffer.lay_out()
             file.finish(out, wall_time_s=work.elapsed, **extra)

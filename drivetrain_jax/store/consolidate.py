@@ -330,6 +330,12 @@ def read_attribute(path: Path, name: str) -> Any:
         return _plain(holds.attrs.get(name))
 
 
+def damage(path: Path) -> str:
+    """The damaged parts of the result at ``path`` by its checksums, in words; empty without damage."""
+    changed = checksums.damaged(path)
+    return "its checksums are gone" if changed is None else checksums.named(changed)
+
+
 def layout(path: Path) -> dict[str, tuple[np.dtype, tuple[int, ...]]]:
     """Types and shapes of all variables of the result at ``path``."""
     with opened(path) as file:

@@ -37,8 +37,8 @@ def is_store(path: Path) -> bool:
     return (path / "zarr.json").is_file() or ((path / _OF_SHARDS).is_dir() and (path / "outcome").is_dir())
 
 
-def create(path: Path, template: Labelled, shards: Shards, fills: Mapping[str, float]) -> None:
-    """Create an empty store for ``template``, whose data are ignored. Raises ``OSError`` without enough space."""
+def create(path: Path, template: Labelled, shards: Shards) -> None:
+    """Create an empty store for ``template``, filled with its first values. Raises ``OSError`` without enough space."""
     zarr = _zarr()
     # As strings of variable length: Zarr has no specification of strings of fixed length yet.
     coords = {
@@ -54,7 +54,7 @@ def create(path: Path, template: Labelled, shards: Shards, fills: Mapping[str, f
             shape=entry.values.shape,
             dtype=entry.values.dtype,
             chunks=(*shards.lengths, *(max(n, 1) for n in inner)),
-            fill_value=fills[name],
+            fill_value=next(entry.values.flat, 0),
             compressors=zarr.codecs.Crc32cCodec(),
             dimension_names=entry.dims,
             attributes={
@@ -132,7 +132,7 @@ def intact(path: Path) -> Iterator[bool]:
         yield read(path, shards, shard) is not None
 
 
-def read_variable(path: Path, name: str) -> np.ndarray:
+def map_variable(path: Path, name: str) -> np.ndarray:
     """One variable of the store; :class:`InputError` if it cannot be read."""
     try:
         return np.asarray(_root(path)[name][...])
@@ -148,6 +148,11 @@ def attributes(path: Path) -> dict[str, Any]:
         return {**root.attrs, **(root[GROUP].attrs if GROUP in root else {})}
     except _BROKEN:
         raise InputError(f"store = {str(path)!r}: not a readable Zarr store; give one of --store zarr") from None
+
+
+def read_attribute(path: Path, name: str) -> Any:
+    """One of :func:`attributes`, None if it is missing."""
+    return attributes(path).get(name)
 
 
 def seal(path: Path, attrs: Mapping[str, Any], labels: Mapping[str, Mapping[str, Any]]) -> None:
