@@ -24,7 +24,6 @@ from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.impacts.attractor import attractors, take
 from drivetrain_jax.analysis.impacts.exact_response import WIDTH, describe
-from drivetrain_jax.analysis.impacts.motion import from_scaled_length, to_scaled_length
 from drivetrain_jax.analysis.steady_state import WAIT
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System
 
@@ -64,17 +63,14 @@ def _solve(
     points, samples = int(np.prod(shape, dtype=int)), options["samples"]
     reach = np.array([[options["reach_u"]], [options["reach_v"]]])
     start = reach * np.random.default_rng(options["seed"]).uniform(-1, 1, (2, samples))
-    model, unit = to_scaled_length(model)
-    units = jnp.repeat(jnp.broadcast_to(unit, (points,)), samples)
-    u0, v0 = (jnp.tile(jnp.asarray(x), points) / units for x in start)
+    u0, v0 = (jnp.tile(jnp.asarray(x), points) for x in start)
     route = jnp.repeat(jnp.arange(points, dtype=jnp.int32), samples)
     motions = attractors(model, route[:, None], u0, v0, most_periods=options["most_periods"], width=WIDTH)
     flat = jax.tree.map(lambda x: x[:, 0], motions)
     motion = describe(take(model, route), flat, rtol=_TOLERANCE, integrals=False)
     kept = ("u_max", "u_min", "period_multiple", "outcome")
     results = shares(*(motion[name].reshape(points, samples).T for name in kept))
-    wanted = from_scaled_length({name: results[name] for name in (*request.outputs, "outcome")}, unit)
-    return {name: x.reshape(*x.shape[:-1], *shape) for name, x in wanted.items()}
+    return {name: results[name].reshape(*results[name].shape[:-1], *shape) for name in (*request.outputs, "outcome")}
 
 
 def shares(high: Array, low: Array, multiple: Array, outcome: Array) -> dict[str, Array]:

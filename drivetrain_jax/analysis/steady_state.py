@@ -32,7 +32,7 @@ from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver, stacked
 from drivetrain_jax.analysis.impacts.attractor import attractors
 from drivetrain_jax.analysis.impacts.exact_response import INTEGRALS, WIDTH, describe, periodic_results
-from drivetrain_jax.analysis.impacts.motion import PHASE, REGIME, REGIMES, from_scaled_length, to_scaled_length
+from drivetrain_jax.analysis.impacts.motion import PHASE, REGIME, REGIMES
 from drivetrain_jax.analysis.impacts.orbit_measures import history, measure
 from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.systems import PiecewiseLinearOscillator, System, UnderdampedOscillator
@@ -65,15 +65,14 @@ def orbit_jacobians(
     def model(parameters: Any) -> PiecewiseLinearOscillator:
         return build(eqx.combine(parameters, constants.tree))
 
-    scaled, unit = to_scaled_length(model(parameters))
-    lengths = jnp.array([unit if name in ("b", "B0", "B1") else 1.0 for name in _FIELDS])
-    by_parameter = stacked(jax.jacfwd(lambda p: _vector(model(p)) / lengths)(parameters))
+    here = model(parameters)
+    by_parameter = stacked(jax.jacfwd(lambda p: _vector(model(p)))(parameters))
     periodic = results["period_multiple"] > 0
-    start = jnp.where(periodic, results["orbit_state"] / unit, 0.0)
+    start = jnp.where(periodic, results["orbit_state"], 0.0)
     multiple = jnp.maximum(results["period_multiple"], 1)
 
     def motion(x: Array) -> dict[str, Array]:
-        oscillator, u, v = replace(scaled, **dict(zip(_FIELDS, x[:-2], strict=True))), x[-2:-1], x[-1:]
+        oscillator, u, v = replace(here, **dict(zip(_FIELDS, x[:-2], strict=True))), x[-2:-1], x[-1:]
         seen = measure(oscillator, u, v, multiple[None], width=1, integrals=not INTEGRALS.isdisjoint(names))
         values = {name: value[..., 0] for name, value in periodic_results(oscillator, seen).items() if name in names}
         if not {"u_history", "v_history"}.isdisjoint(names):
@@ -81,15 +80,14 @@ def orbit_jacobians(
             values |= dict(zip(("u_history", "v_history"), (x[:, 0] for x in sampled), strict=True))
         return values | {"end": jnp.stack(seen.end)[:, 0]}
 
-    moved = jax.jacfwd(motion)(jnp.concatenate([_vector(scaled), start]))
+    moved = jax.jacfwd(motion)(jnp.concatenate([_vector(here), start]))
     end = moved.pop("end")
     state = jnp.linalg.solve(jnp.eye(2) - end[:, -2:], end[:, :-2])
     slopes = {name: x[..., :-2] + x[..., -2:] @ state for name, x in moved.items()}
     if "orbit_state" in names:
         slopes["orbit_state"] = state
-    ended = (_vector(scaled) == 0) & _ENDS
-    slopes = {name: _chained(jnp.where(ended | ~periodic, jnp.nan, x), by_parameter) for name, x in slopes.items()}
-    return from_scaled_length(slopes, unit)
+    ended = (_vector(here) == 0) & _ENDS
+    return {name: _chained(jnp.where(ended | ~periodic, jnp.nan, x), by_parameter) for name, x in slopes.items()}
 
 
 def _vector(oscillator: PiecewiseLinearOscillator) -> Array:
@@ -156,21 +154,18 @@ def _solve(
     start = [values[system.role(role)] for role in _STARTS]
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in (*vars(model).values(), *start)))
     count = int(np.prod(shape, dtype=int))
-    model, unit = to_scaled_length(model)
-    u0, v0 = (jnp.broadcast_to(jnp.asarray(x, float) / unit, (count,)) for x in start)
+    u0, v0 = (jnp.broadcast_to(jnp.asarray(x, float), (count,)) for x in start)
     route = jnp.arange(count, dtype=jnp.int32)[:, None]
     motions = attractors(model, route, u0, v0, most_periods=request.options["most_periods"], width=WIDTH)
     flat = jax.tree.map(lambda x: x[:, 0], motions)
     integrals = not INTEGRALS.isdisjoint(request.outputs)
-    largest = np.finfo(float).max / jnp.maximum(unit, 1.0)
-    results = describe(model, flat, rtol=request.options["rtol"], integrals=integrals, largest=largest)
+    results = describe(model, flat, rtol=request.options["rtol"], integrals=integrals)
     if not HISTORIES.isdisjoint(request.outputs):
         known = results["outcome"] < Outcome.NOT_CONVERGED
         u, v = (jnp.where(known, x, jnp.nan) for x in (flat.u, flat.v))
         sampled = history(model, u, v, results["period_multiple"], SAMPLES)
         results |= dict(zip(("u_history", "v_history"), sampled, strict=True))
-    wanted = from_scaled_length({name: results[name] for name in (*request.outputs, "outcome")}, unit)
-    return {name: x.reshape(*x.shape[:-1], *shape) for name, x in wanted.items()}
+    return {name: results[name].reshape(*results[name].shape[:-1], *shape) for name in (*request.outputs, "outcome")}
 
 
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:

@@ -9,8 +9,7 @@ that follows in time. Methods: the exact solution, harmonic balance (a chosen nu
 paper's closed form for a cubic spring) and the describing function (bias and fundamental). ``residual`` is the rms residual
 of the equation of motion.
 
-Outcome: the worse one of both directions. Results of the other direction are kept. Approximate methods end as ``NOT_FINITE``
-where a frequency, a rate or a ratio of their numbers is beyond 1e70 or, if not 0, below 1e-70: their powers would overflow.
+Outcome: the worse one of both directions. Results of the other direction are kept.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial, reduce
+from functools import partial
 from typing import Any
 
 import jax
@@ -43,8 +42,6 @@ from drivetrain_jax.analysis.impacts.motion import (
     STABILITY,
     STABLE,
     UNSTABLE,
-    from_scaled_length,
-    to_scaled_length,
 )
 from drivetrain_jax.analysis.numerics.continuation import course, folds_and_doublings, follow, sections
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
@@ -238,8 +235,6 @@ _ONLY = {
 # Closed forms of curves whose drive has one amplitude.
 _OF_ONE_DRIVE = frozenset(("peak_amplitude", "peak_frequency", "fold_frequency"))
 _SPECIAL = frozenset(("fold_frequency", "doubling_frequency"))
-# Largest number, in units of length of the motions and of seconds, and inverse of the smallest: fourth powers are finite.
-_LARGE = 1e70
 # Lines of a chunk: for a map of 200 lines, equally many for two cores.
 _CHUNK = 50
 
@@ -281,7 +276,7 @@ def _solve(
     build: Callable[..., PiecewiseLinearOscillator], request: Request, values: Mapping[str, Any], effort: Array
 ) -> dict[str, Array]:
     """A line; ``effort`` only orders the batches."""
-    model, unit = to_scaled_length(build(values))
+    model = build(values)
     model.check_method(model.damps_play, request.method)
     options, shape = request.options, _shape(model)
     if request.method == "exact":
@@ -291,34 +286,11 @@ def _solve(
         results = harmonic_response.response(model, basis, shape, request.outputs)
     else:
         asked = options.get("fit_range", 0.0)
-        fit_range = asked / unit if asked > 0 else None
+        fit_range = jnp.asarray(asked) if asked > 0 else None
         results = closed_form_response.response(model, request.method, fit_range, shape, request.outputs)
-    results = from_scaled_length(results, unit)
-    if request.method != "exact":
-        results |= {"outcome": jnp.where(_in_range(model), results["outcome"], Outcome.NOT_FINITE).astype(jnp.int8)}
-        results |= _without(results["outcome"] == Outcome.NOT_FINITE, results)
     return finite_results(
         results, path=True, gaps=BUILT_IN["frequency_response"].gaps, infinite=("peak_amplitude", "fit_range")
     )
-
-
-def _in_range(model: PiecewiseLinearOscillator) -> Array:
-    """True for frequencies and lanes in which no product of the closed forms overflows or underflows, ``(L, ...)``."""
-    omega = jnp.asarray(model.omega).reshape(-1, *(1,) * len(_shape(model)))
-    drive = model.amplitude(omega) / model.stiffness
-    numbers = omega, model.damping, jnp.sqrt(model.stiffness), model.alpha, model.B0 / model.stiffness, drive
-    sizes = [jnp.abs(jnp.asarray(x, float)) for x in numbers]
-    return reduce(jnp.logical_and, [(x == 0) | ((x >= 1 / _LARGE) & (x <= _LARGE)) for x in sizes])
-
-
-def _without(lost: Array, results: Mapping[str, Array]) -> dict[str, Array]:
-    """``results`` with NaN, or ``ABSENT`` for stabilities, at the frequencies that are ``lost`` ``(L, ...)``."""
-
-    def kept(x: Array, nothing: Any) -> Array:
-        return jnp.where(jnp.expand_dims(lost, tuple(range(1, 1 + x.ndim - lost.ndim))), nothing, x).astype(x.dtype)
-
-    numbers = {name: kept(x, jnp.nan) for name, x in results.items() if jnp.issubdtype(x.dtype, jnp.inexact)}
-    return numbers | {name: kept(x, ABSENT) for name, x in results.items() if name.endswith("stability")}
 
 
 def _exact(model: PiecewiseLinearOscillator, request: Request) -> dict[str, Array]:

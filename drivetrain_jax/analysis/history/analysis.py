@@ -44,7 +44,6 @@ from drivetrain_jax.analysis.history.integration import (
     limits_of,
     requested_times,
 )
-from drivetrain_jax.analysis.impacts.motion import to_scaled_length
 from drivetrain_jax.analysis.impacts.piecewise_march import (
     Lanes,
     Motion,
@@ -236,15 +235,14 @@ def _exact(system: type[System], request: Request, values: Mapping[str, Any], ef
     model: PiecewiseLinearOscillator = system.models["history"].build(values)
     starts = [values[system.role(role)] for role in _STARTS]
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in (*vars(model).values(), *starts)))
-    scaled, unit = to_scaled_length(model)
-    u0, v0 = (jnp.broadcast_to(jnp.asarray(x, float) / unit, shape or (1,)) for x in starts)
-    u, v, events, stuck = timed_motion(scaled, u0, v0, times, request.options["most_events"])
+    u0, v0 = (jnp.broadcast_to(jnp.asarray(x, float), shape or (1,)) for x in starts)
+    u, v, events, stuck = timed_motion(model, u0, v0, times, request.options["most_events"])
     finite = jnp.all(jnp.isfinite(u), axis=0)
     outcome = jnp.where(stuck, Outcome.STEP_LIMIT, jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE))
     names = tuple(c.name for c in system.state)
-    results = dict(zip(names, (u * unit, v * unit), strict=True))
-    results["acceleration"] = model.field(times[:, None], jnp.stack([u * unit, v * unit]))[1]
-    results |= {"event_time": events.time, "event_flank": events.flank, "event_velocity": events.velocity * unit}
+    results = dict(zip(names, (u, v), strict=True))
+    results["acceleration"] = model.field(times[:, None], jnp.stack([u, v]))[1]
+    results |= {"event_time": events.time, "event_flank": events.flank, "event_velocity": events.velocity}
     results |= {"event_count": events.number, "outcome": outcome.astype(jnp.int8)}
     wanted = finite_results({name: results[name] for name in (*request.outputs, "outcome")}, gaps=_EVENTS)
     return {name: x.reshape(*x.shape[:-1], *shape) for name, x in wanted.items()}
@@ -274,11 +272,10 @@ def _averaged(system: type[System], request: Request, values: Mapping[str, Any],
     model: PiecewiseLinearOscillator = system.models["history"].build(values)
     model.check_method(model.damps_play, request.method)
     u0, v0 = (jnp.asarray(values[system.role(role)], float) for role in _STARTS)
-    scaled, unit = to_scaled_length(model)
     asked = request.options["fit_range"]
-    flow, frequency = averaged_flow(scaled, jnp.asarray(asked / unit) if asked > 0 else None, u0 / unit, v0 / unit)
+    flow, frequency = averaged_flow(model, jnp.asarray(asked) if asked > 0 else None, u0, v0)
     history = integrated(flow, request)
-    real, imaginary = history.states.T * unit
+    real, imaginary = history.states.T
     turned = model.omega * jnp.asarray(requested_times(request))
     cosine, sine = jnp.cos(turned), jnp.sin(turned)
     u, v = real * cosine + imaginary * sine, frequency * (imaginary * cosine - real * sine)

@@ -8,7 +8,6 @@ the lanes.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -57,12 +56,7 @@ WIDTH, _SWEEP_WIDTH = 64, 32
 
 
 def describe(
-    oscillator: PiecewiseLinearOscillator,
-    motions: Attractors,
-    *,
-    rtol: float,
-    integrals: bool = True,
-    largest: Any = jnp.inf,
+    oscillator: PiecewiseLinearOscillator, motions: Attractors, *, rtol: float, integrals: bool = True
 ) -> dict[str, Array]:
     """All results of ``motions``, every field of shape ``(N,)`` as those of ``oscillator``.
 
@@ -72,7 +66,7 @@ def describe(
     grown by exp(20) over the last three quarters of the run, is non-periodic (``period_multiple`` 0), or still a transient,
     and measured over 32 drive periods. Any other motion has not settled, nor has an orbit whose spectral radius exceeds 1.
     ``outcome`` is TOLERANCE_NOT_MET where the estimated error of u exceeds ``rtol`` times its size, or a thousandth of the
-    largest distance from the flanks, and NOT_FINITE where its size exceeds ``largest``.
+    largest distance from the flanks.
     """
     stopped = motions.stalled == 1
     u, v = jnp.where(stopped, jnp.nan, motions.u), motions.v
@@ -88,7 +82,7 @@ def describe(
     unstable = periodic & (results["spectral_radius"] > 1 + _UNSTABLE)
     outcome = jnp.where((periodic | wild) & ~unstable, outcome, Outcome.NOT_CONVERGED)
     outcome = jnp.where((motions.stalled > 0) | (seen.complete == 0), Outcome.STEP_LIMIT, outcome)
-    finite = jnp.isfinite(motions.u) & (stopped | (jnp.isfinite(seen.high + seen.low) & (size <= largest)))
+    finite = jnp.isfinite(motions.u) & (stopped | jnp.isfinite(seen.high + seen.low))
     outcome = jnp.where(finite, outcome, Outcome.NOT_FINITE)
     known = outcome < Outcome.NOT_CONVERGED
     results |= {name: jnp.where(periodic, results[name], jnp.nan) for name in ("floquet_multiplier", "spectral_radius")}
