@@ -167,9 +167,8 @@ def verdict_words(verdict: str, grows: Mapping[str, float], radius: bool = True)
     return [word, *(line.strip() for line in growth_lines(grows, width=0, sign=""))]
 
 
-# Relative step of central differences of the conversions of physical data, and step at 0. Part of the largest effect below
-# which an effect is rounding.
-_STEP, _ROUNDING = 1e-5, 1e-9
+# Part of the largest effect below which an effect is rounding.
+_ROUNDING = 1e-9
 
 
 class Sensitivity(NamedTuple):
@@ -200,8 +199,8 @@ def point_sensitivities(
 def _of_radius(
     system: type[System], shaft: GivenData | None, point: Mapping[str, Any], slopes: Mapping[str, float]
 ) -> list[Sensitivity]:
-    def change(changes: Mapping[str, float], _: Any) -> float:
-        return sum(slopes[name] * x for name, x in changes.items() if name in slopes)
+    def change(changes: Mapping[str, Any], _: Any) -> Any:
+        return sum((slopes[name] * x for name, x in changes.items() if name in slopes), 0.0)
 
     return _of_data(system, shaft, point, "", change)
 
@@ -217,10 +216,10 @@ def limit_sensitivities(asked: AtlasQuery, parameter: str, limit: Crossing) -> l
         return []
     turned = {name: -slope / slopes[parameter] for name, slope in slopes.items() if name != parameter}
 
-    def limit_at(changes: Mapping[str, float], data: Mapping[str, Any]) -> float:
+    def limit_at(changes: Mapping[str, Any], data: Mapping[str, Any]) -> Any:
         value = limit.value + sum(turned[n] * x for n, x in changes.items() if n in turned)
         back = asked.shaft.physical.back(parameter, data) if asked.shaft else None
-        return float(back[1](value)) if back else value
+        return back[1](value) if back else value
 
     return _of_data(asked.atlas.scene.system, asked.shaft, point, parameter, limit_at)
 
@@ -230,7 +229,7 @@ def _of_data(
     shaft: GivenData | None,
     point: Mapping[str, float],
     without: str,
-    answer: Callable[[dict[str, float], Any], float],
+    answer: Callable[[dict[str, Any], Any], Any],
 ) -> list[Sensitivity]:
     """Sensitivities of ``answer(changes of the parameters, data)`` by the physical data, and by parameters without such.
 
@@ -251,18 +250,14 @@ def _of_data(
             name: value for name, value in data.items() if name not in known
         }
 
-    def at(data: Mapping[str, Any]) -> float:
-        converted = shaft.physical.converted(data) if shaft else {}
-        parameters = {**data, **converted}
-        return answer({name: parameters[name] - x for name, x in point.items() if name in parameters}, data)
+    def at(numbers: Mapping[str, Any]) -> Any:
+        everything = {**data, **numbers}
+        parameters = everything | (shaft.physical.converted(everything) if shaft else {})
+        return answer({name: parameters[name] - x for name, x in point.items() if name in parameters}, everything)
 
-    names, sensitivities = described(system), []
-    for name, value in data.items():
-        if names[name].integer:
-            continue
-        step = _STEP * abs(value) or _STEP
-        slope = (at({**data, name: value + step}) - at({**data, name: value - step})) / (2 * step)
-        sensitivities.append(Sensitivity(name, names[name].units, slope, slope * value / 100))
+    names = described(system)
+    slopes = jax.grad(at)({name: float(value) for name, value in data.items() if not names[name].integer})
+    sensitivities = [Sensitivity(n, names[n].units, float(x), float(x) * data[n] / 100) for n, x in slopes.items()]
     return sorted(sensitivities, key=lambda rule: -abs(rule.percent))
 
 

@@ -139,7 +139,7 @@ PHYSICAL = PhysicalData(
         *stiffness_of_tubes("stiffness", replaceable=True),
         Conversion("k1", ("stiffness",), partial(_entry, 0), "stiffness[0]", replaceable=True, whole=("stiffness",)),
         Conversion("k2", ("stiffness",), partial(_entry, 1), "stiffness[1]", replaceable=True, whole=("stiffness",)),
-        Conversion("beta", ("angle",), _radians, "angle", np.degrees),
+        Conversion("beta", ("angle",), _radians, "angle", lambda beta: beta * (180 / np.pi)),
         Conversion(
             "Omega",
             ("speed", "J1", "k1"),
