@@ -21,7 +21,7 @@ from drivetrain_jax._plugins import RULES, call_plugin, load_plugin
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax._rules import BUILT_IN, Declared, Rule, in_order, multiple, ordered, relation, sums_to_one, within
 from drivetrain_jax.store import checksums, zarr_store
-from drivetrain_jax.store.consolidate import open_result, read_attribute
+from drivetrain_jax.store.consolidate import attributes, open_result
 from drivetrain_jax.store.parts import PartsFolder
 
 __all__ = [
@@ -201,7 +201,7 @@ def _verify_file(path: Path) -> Report:
         names = checksums.named(damaged)
         problem = f"{names}: damaged; allowed is to restore the file or to compute it again"
         return Report((f"checksums: {len(damaged)} differ: {names}",), problem)
-    if damaged is None and read_attribute(path, "digest") is not None:
+    if damaged is None and "digest" in attributes(path):
         problem = "its checksums are gone; allowed is to restore the file or to compute it again"
         return Report(("checksums: gone",), problem)
     sealed = "none in this file" if damaged is None else "all agree"
@@ -245,8 +245,8 @@ def _verify_parts(parts: PartsFolder) -> Report:
         present, shards = np.flatnonzero(zarr_store.done(store)).tolist(), zarr_store.shards_of(store)
         intact = sum(zarr_store.read(store, shards, number) is not None for number in present)
     else:
-        present = parts.blocks.numbers()
-        intact = sum(parts.blocks.read(number) is not None for number in present)
+        present = parts.numbers()
+        intact = sum(parts.read(number) is not None for number in present)
     lines = [f"unfinished: {intact} of {len(present)} blocks are intact"]
     if intact < len(present):
         lines.append("the run that resumes computes the others again")

@@ -24,7 +24,7 @@ from drivetrain_jax.runs.scene import Problem, Scene, restore_scene, result_vari
 from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.consolidate import CONVENTIONS, Entry, Labelled, ResultFile, release
 from drivetrain_jax.store.files import command, flush_tree, move_folder, now, versions
-from drivetrain_jax.store.parts import Arrays, BlockFiles, PartsFolder
+from drivetrain_jax.store.parts import Arrays, PartsFolder
 from drivetrain_jax.systems import System
 
 if TYPE_CHECKING:
@@ -323,7 +323,7 @@ class ZarrBlocks:
         move_folder(path, parts.out)
 
 
-BlockStore = BlockFiles | ZarrBlocks
+BlockStore = PartsFolder | ZarrBlocks
 
 
 def export(store: Path, out: Path) -> int:

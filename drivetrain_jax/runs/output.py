@@ -98,7 +98,7 @@ class Output:
             return None
         allowed = "allowed is a new file or a result of drivetrain_jax"
         try:
-            digest = self._files.read_attribute(self.out, "digest")
+            digest = self._files.attributes(self.out).get("digest")
         except InputError:
             if self.store == HDF5:
                 raise self.error(f"not a readable netCDF4/HDF5 file; {allowed}") from None
@@ -228,7 +228,7 @@ class Output:
     @property
     def blocks(self) -> BlockStore:
         """The store of unfinished work."""
-        return ZarrBlocks.among(self.parts, self.job) if self.store == ZARR else self.parts.blocks
+        return ZarrBlocks.among(self.parts, self.job) if self.store == ZARR else self.parts
 
     def finished(self) -> Iterator[tuple[np.ndarray, Results]]:
         """Yield points and results of unfinished work, reused ones included."""
@@ -262,10 +262,7 @@ class Output:
             return f"{what} that was started for another result"
         if self.unfinished and self.store != stored.get("store"):
             return f"{what} of --store {stored.get('store')}"
-        if not stored:
-            names = ("scene", "drivetrain_jax_version", "numerics", "numerics_detail")
-            stored = {name: self._files.read_attribute(self.out, name) for name in names}
-        reasons = differences(stored, self.job)
+        reasons = differences(stored or self._files.attributes(self.out), self.job)
         more = f" and {len(reasons) - 2} more" if len(reasons) > 2 else ""
         return f"{what} of another scene or version: {'; '.join(reasons[:2]) or 'other sizes of chunks'}{more}"
 
@@ -273,8 +270,8 @@ class Output:
         """Number of points of the complete result, and their outcomes; of an atlas its solves, which have no outcomes."""
         if self.job.scene.analysis.continuous:
             try:
-                return int(self._files.read_attribute(self.out, "solves")), np.empty(0, OUTCOME.dtype)
-            except (TypeError, ValueError):
+                return int(self._files.attributes(self.out)["solves"]), np.empty(0, OUTCOME.dtype)
+            except (KeyError, TypeError, ValueError):
                 raise self.error("no atlas has these attributes; --fresh replaces it") from None
         return self.job.total, self._files.map_variable(self.out, OUTCOME.name)
 

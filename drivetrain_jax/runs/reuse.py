@@ -121,7 +121,7 @@ def find(job: Job, path: Path) -> ReusableResult:
     Raises :class:`NotReusable`, or :class:`InputError` if there is no readable result.
     """
     try:
-        attrs = consolidate.read_attributes(path)
+        attrs = consolidate.attributes(path)
     except InputError as error:
         raise InputError(str(error).replace("file = ", "reuse = ", 1)) from None
     if "digest" not in attrs:

@@ -141,13 +141,13 @@ def _into(output: Output, reused: ReusedPoints, fresh: bool, executor: Threads, 
         begins = not output.resumes(reused, fresh)
         if begins:
             parts.start(output.plan(reused, fresh))
-        with Work(executor, report, output.blocks) as work:
-            if isinstance(work.store, ZarrBlocks):
-                work.store.create()
-                work.do(job, None, progress)
-                work.store.finish(parts, wall_time_s=work.elapsed)
-            else:
-                job.route.into_file(job, output.out, parts.result, work, progress, reused)
+        work = Work(executor, report, output.blocks)
+        if isinstance(work.store, ZarrBlocks):
+            work.store.create()
+            work.do(job, None, progress)
+            work.store.finish(parts, wall_time_s=work.elapsed)
+        else:
+            job.route.into_file(job, output.out, parts.result, work, progress, reused)
         parts.close(remove=True)
     except KeyboardInterrupt:
         raise Interrupted(progress) from None
@@ -161,6 +161,7 @@ def _into(output: Output, reused: ReusedPoints, fresh: bool, executor: Threads, 
         # No "the same command resumes": it would fail again.
         raise Incomplete(str(error), progress) from error
     finally:
+        executor.close()
         parts.close()
     return progress
 
@@ -183,11 +184,13 @@ def _job(scene: str | Path | Mapping[str, Any] | Scene, overrides: Mapping[str, 
 def _in_memory(job: Job, executor: Threads, report: Report | None) -> xr.Dataset:
     progress = _progress(job)
     try:
-        with Work(executor, report) as work:
-            result = job.route.in_memory(job, work, progress)
-            return result.with_attrs(wall_time_s=work.elapsed).to_dataset()
+        work = Work(executor, report)
+        result = job.route.in_memory(job, work, progress)
+        return result.with_attrs(wall_time_s=work.elapsed).to_dataset()
     except ChunkError as error:
         raise Incomplete(str(error), progress) from error
+    finally:
+        executor.close()
 
 
 # Seconds before a bar appears, and between its updates.

@@ -8,9 +8,9 @@ import re
 import sys
 import time
 import uuid
-from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
@@ -321,30 +321,29 @@ def make_executor(threads: int | None = None, workers: int | None = None, dask: 
 
     Raises :class:`InputError` for invalid or conflicting settings.
     """
-    for name, value in (("threads", threads), ("workers", workers)):
+    settings = {"threads": threads, "workers": workers, "dask": dask}
+    named = {name: value for name, value in settings.items() if value is not None}
+    for name, value in named.items():
         is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-        if value is not None and not (is_integer and value >= 1):
+        if name != "dask" and not (is_integer and value >= 1):
             raise InputError(f"{name} = {shown(value)}: allowed is {name} >= 1, an integer")
     if dask is not None and not re.match(r"local:[1-9]\d*$|\w+://", str(dask)):
         raise InputError(f"dask = {dask!r}: allowed is tcp://HOST:PORT or local:N with N >= 1")
-    settings = {"threads": threads, "workers": workers, "dask": dask}
-    named = [name for name, value in settings.items() if value is not None]
     if len(named) > 1:
-        raise InputError(f"{named[0]}: given together with {named[1]}; allowed is one of them")
-    if workers is None and dask is None:
-        return Threads(threads)
-    return Cluster(dask or f"local:{workers}")
+        first, second, *_ = named
+        raise InputError(f"{first}: given together with {second}; allowed is one of them")
+    return Cluster(dask or f"local:{workers}") if workers or dask else Threads(threads)
 
 
 class Receiver(Protocol):
     """Receives results: the buffer of a scene, or a collector of solves."""
 
-    def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
+    def fill(self, points: np.ndarray, results: Results) -> None:
         """Write the results of ``points``."""
 
 
 class Work:
-    """Runs blocks on the executor and reports progress. Leaving the context ends the workers.
+    """Runs blocks on the executor and reports progress.
 
     With a ``store`` finished blocks are kept there, and blocks that it has are not computed again.
     """
@@ -358,12 +357,6 @@ class Work:
         """Time since the start in s."""
         return round(time.monotonic() - self._begin, 3)
 
-    def __enter__(self) -> Work:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.executor.close()
-
     def do(
         self, job: Job, receiver: Receiver | None, progress: Progress, first: int = 0, points: np.ndarray | None = None
     ) -> None:
@@ -371,9 +364,17 @@ class Work:
 
         Without a receiver they are only stored. Numbers in the store start at ``first``.
         """
-        done = set[int]()
-        length, left = job.grid.path_length, job.grid.size if points is None else len(points)
-        for block, results in self._stored(job, first, points, done):
+        done, length, left = set[int](), job.grid.path_length, job.grid.size if points is None else len(points)
+
+        def stored() -> Iterator[tuple[Block, Results]]:
+            if self.store is not None:
+                yield from stored_blocks(self.store, job, points, first, done)
+
+        def tick(count: int) -> None:
+            progress.cost += count * length
+            self.report(progress)
+
+        for block, results in stored():
             done.add(block.number)
             left -= len(results[OUTCOME.name])
             if receiver is not None:
@@ -382,22 +383,13 @@ class Work:
             progress.count(results[OUTCOME.name])
         progress.cost, progress.total_cost, computed = 0.0, float(left * length), 0
         self.report(progress)
-
-        def tick(count: int) -> None:
-            progress.cost += count * length
-            self.report(progress)
-
         missing = (block for block in job.blocks(points) if block.number not in done)
         try:
             # Closed on exit: after an interrupt nothing further starts.
-            with (
-                self._reported(progress),
-                closing(self.executor.run(job, missing, self.store, first, tick)) as finished,
-            ):
+            with closing(self.executor.run(job, missing, self.store, first, tick)) as finished:
                 for block, results in finished:
-                    results = self._received(job, block, results, first, receiver)
+                    outcome = self._received(job, block, results, first, receiver)[OUTCOME.name]
                     done.add(block.number)
-                    outcome = results[OUTCOME.name]
                     progress.count(outcome)
                     progress.computed += outcome.size
                     computed += outcome.size
@@ -405,19 +397,12 @@ class Work:
                     self.report(progress)
             if computed < progress.total_cost:
                 raise RetryableError("some blocks returned no result")
-        except KeyboardInterrupt:
-            # It may come between storing a block and counting it.
-            for _, results in self._stored(job, first, points, done):
+        except BaseException:
+            # An interrupt may come between storing a block and counting it.
+            for _, results in stored():
                 progress.computed += results[OUTCOME.name].size
                 progress.count(results[OUTCOME.name])
-            raise
-
-    @contextmanager
-    def _reported(self, progress: Progress) -> Iterator[None]:
-        """Report before an exception passes: if it is an interrupt in a library's code, the report raises that again."""
-        try:
-            yield
-        except Exception:
+            # If an exception is an interrupt in a library's code, the report raises that again.
             self.report(progress)
             raise
 
@@ -439,11 +424,6 @@ class Work:
                     raise RetryableError(f"block {block.number} is missing after a worker has stored it; {where}")
             receiver.fill(job.points(block), results)
         return results
-
-    def _stored(
-        self, job: Job, first: int, points: np.ndarray | None, without: Container[int]
-    ) -> Iterator[tuple[Block, Results]]:
-        return iter(()) if self.store is None else stored_blocks(self.store, job, points, first, without)
 
 
 class Route:

@@ -63,7 +63,7 @@ def unreadable(path: Path) -> InputError:
 
 def reserve(file: h5py.File) -> None:
     """Reserve space for the checksums of everything in ``file``, so filling them in needs no disk space."""
-    blank = json.dumps(dict.fromkeys([FILE, *_groups(file), *_variables(file)], "0" * 32))
+    blank = json.dumps(dict.fromkeys([FILE, *_members(file, h5py.Group), *_members(file, h5py.Dataset)], "0" * 32))
     file.attrs.create(ATTRIBUTE, np.bytes_(blank))
 
 
@@ -77,14 +77,11 @@ def checksums(file: h5py.File) -> dict[str, str]:
 
     The checksum of a variable includes its type, dimensions and attributes.
     """
-    variables = _variables(file)
-    if sum(variable.nbytes for variable in variables.values()) < _LARGE:
-        digests = [_of_variable(variable) for variable in variables.values()]
-    else:
-        # Hashing releases the interpreter's lock.
-        with ThreadPoolExecutor(min(usable_cores(), len(variables)), thread_name_prefix="hash") as pool:
-            digests = list(pool.map(_of_variable, variables.values()))
-    owners = {FILE: file, **_groups(file)}
+    variables, owners = _members(file, h5py.Dataset), {FILE: file, **_members(file, h5py.Group)}
+    # Hashing releases the interpreter's lock.
+    large = sum(variable.nbytes for variable in variables.values()) >= _LARGE
+    with ThreadPoolExecutor(min(usable_cores(), len(variables)) if large else 1, thread_name_prefix="hash") as pool:
+        digests = [*(pool.map if large else map)(_of_variable, variables.values())]
     attributes = {name: _of_attributes(owner, {ATTRIBUTE}).hexdigest() for name, owner in owners.items()}
     return attributes | dict(zip(variables, digests, strict=True))
 
@@ -98,26 +95,29 @@ def damaged(path: Path) -> list[str] | None:
         stored = file.attrs.get(ATTRIBUTE)
         if stored is None:
             return None
-        wanted, present = _parsed(stored), checksums(file)
+        try:
+            wanted = dict(json.loads(stored))
+        except (ValueError, TypeError):
+            # A damaged table: nothing matches.
+            wanted = {}
+        present = checksums(file)
     return sorted(name for name in {*wanted, *present} if wanted.get(name) != present.get(name))
 
 
 def refuse_damaged(path: Path, *, rewritten: bool = False) -> None:
     """Raise :class:`InputError` if ``path`` is a file whose checksums show damage.
 
-    A copy that another program has written keeps the checksums as an attribute like any other, perhaps with other values.
-    It is compared only if ``rewritten``.
+    A copy that another program, such as h5netcdf, has written keeps the checksums as an attribute like any other, perhaps
+    with other values. It is compared only if ``rewritten``.
     """
-    if path.is_file() and (rewritten or not _rewritten(path)) and (changed := damaged(path)):
-        what = f"damaged ({named(changed)})"
-        raise InputError(f"file = {str(path)!r}: {what}; allowed is to restore it or to compute it again") from None
-
-
-def _rewritten(path: Path) -> bool:
-    """True if another program, such as h5netcdf, has written the file."""
+    if not path.is_file():
+        return
     with opened(path) as file:
         maker = np.asarray(file.attrs.get("_NCProperties", b"")).tobytes()
-    return bool(maker) and not maker.startswith(b"version=2,h5py=")
+    ours = not maker or maker.startswith(b"version=2,h5py=")
+    if (rewritten or ours) and (changed := damaged(path)):
+        what = f"damaged ({named(changed)})"
+        raise InputError(f"file = {str(path)!r}: {what}; allowed is to restore it or to compute it again") from None
 
 
 def named(names: list[str]) -> str:
@@ -125,52 +125,30 @@ def named(names: list[str]) -> str:
     return ", ".join("attributes of the file" if name == FILE else name for name in names)
 
 
-def _variables(file: h5py.File) -> dict[str, h5py.Dataset]:
-    # A file may also contain the named type of its complex numbers.
-    return {name: variable for name in sorted(file) if isinstance(variable := file[name], h5py.Dataset)}
-
-
-def _groups(file: h5py.File) -> dict[str, h5py.Group]:
-    return {name: group for name in sorted(file) if isinstance(group := file[name], h5py.Group)}
-
-
-def _parsed(stored: Any) -> dict[str, str]:
-    """The stored table of checksums; empty if it is damaged, so that nothing matches."""
-    try:
-        table = json.loads(stored)
-    except (ValueError, TypeError):
-        return {}
-    return table if isinstance(table, dict) else {}
+def _members(file: h5py.File, kind: type[Any]) -> dict[str, Any]:
+    """The variables or groups of a file, which may also contain the named type of its complex numbers."""
+    return {name: member for name in sorted(file) if isinstance(member := file[name], kind)}
 
 
 def _of_variable(variable: h5py.Dataset) -> str:
     state = _of_attributes(variable, _LINKS)
     dims = [scales[0].name if len(scales) else scales.label for scales in variable.dims]
     state.update(json.dumps([dims, variable.dtype.str, variable.shape, repr(variable.fillvalue)]).encode())
-    for block in _blocks(variable):
-        state.update(_bytes(block))
+    # In blocks of some megabytes; whole variables if they are scalar, empty or small.
+    count = variable.shape[0] if variable.shape else 1
+    rows = max(_BLOCK * count // max(variable.nbytes, 1), 1)
+    for start in range(0, count, rows) if rows < count else [None]:
+        state.update(_bytes(np.asarray(variable[()] if start is None else variable[start : start + rows])))
     return state.hexdigest()
-
-
-def _blocks(variable: h5py.Dataset) -> Iterator[np.ndarray]:
-    """Yield the values in blocks of some megabytes."""
-    shape, size = variable.shape, variable.nbytes
-    if not shape or 0 < size <= _BLOCK:
-        yield np.asarray(variable[()])
-        return
-    rows = max(_BLOCK * shape[0] // max(size, 1), 1)
-    for start in range(0, shape[0], rows):
-        yield variable[start : start + rows]
 
 
 def _of_attributes(owner: h5py.HLObject, apart: Collection[str]) -> hashlib.blake2b:
     """The hash state after all attributes of ``owner`` except ``apart``."""
-    state, attributes = hashlib.blake2b(digest_size=16), owner.attrs
-    for name in sorted(attributes):
-        if name not in apart:
-            value = np.asarray(attributes[name])
-            state.update(json.dumps([name, value.dtype.str, value.shape]).encode())
-            state.update(_bytes(value))
+    state = hashlib.blake2b(digest_size=16)
+    for name in sorted(set(owner.attrs) - {*apart}):
+        value = np.asarray(owner.attrs[name])
+        state.update(json.dumps([name, value.dtype.str, value.shape]).encode())
+        state.update(_bytes(value))
     return state
 
 

@@ -139,7 +139,8 @@ def _write(file: h5py.File, result: Labelled) -> dict[str, int]:
     # Auxiliary coordinates, which a reader cannot find through the dimensions of a variable (CF, 5).
     sizes = result.sizes
     aside = {name: entry for name, entry in result.coords.items() if name not in sizes}
-    _set(file, {**shown, **_coordinates(sorted(aside)), "_NCProperties": np.bytes_(_MADE_BY)})
+    listed = {"coordinates": " ".join(sorted(aside))} if aside else {}
+    _set(file, {**shown, **listed, "_NCProperties": np.bytes_(_MADE_BY)})
     if details:
         _set(file.create_group(GROUP, track_order=True), details)
     for name, entry in result.coords.items():
@@ -156,7 +157,8 @@ def _write(file: h5py.File, result: Labelled) -> dict[str, int]:
         early.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
         variable = _create(file, name, entry, shape=entry.values.shape, dcpl=early, fill_time="never")
         _link(variable, entry, scales)
-        _set(variable, _coordinates([n for n, c in aside.items() if {*c.dims} <= {*entry.dims}]))
+        if names := [n for n, c in aside.items() if {*c.dims} <= {*entry.dims}]:
+            _set(variable, {"coordinates": " ".join(names)})
         if not entry.dims:
             variable[()] = entry.values  # HDF5 allocates a scalar when it is written.
         places[name] = variable.id.get_offset() or 0
@@ -210,10 +212,6 @@ def _set(owner: h5py.HLObject, attrs: Mapping[str, Any]) -> None:
     """Write attributes; netCDF stores a scalar number as an array of one."""
     for name, value in attrs.items():
         owner.attrs[name] = value if isinstance(value, str) else np.atleast_1d(value)
-
-
-def _coordinates(names: Sequence[str]) -> dict[str, str]:
-    return {"coordinates": " ".join(names)} if names else {}
 
 
 # Upper limit of the bytes of a variable's attributes.
@@ -312,7 +310,7 @@ def release(arrays: Iterable[np.ndarray]) -> None:
             mapped.madvise(mmap.MADV_DONTNEED)
 
 
-def read_attributes(path: Path) -> dict[str, Any]:
+def attributes(path: Path) -> dict[str, Any]:
     """The global attributes of the result at ``path`` with its details as texts and numbers.
 
     Raises :class:`InputError` if the file is not readable.
@@ -321,13 +319,6 @@ def read_attributes(path: Path) -> dict[str, Any]:
         # Older files have no group of details.
         details = file[GROUP].attrs.items() if GROUP in file else ()
         return {name: _plain(value) for name, value in (*details, *file.attrs.items())}
-
-
-def read_attribute(path: Path, name: str) -> Any:
-    """One of :func:`read_attributes`, None if it is missing, without reading the others."""
-    with opened(path) as file:
-        holds = file[GROUP] if name not in file.attrs and GROUP in file else file
-        return _plain(holds.attrs.get(name))
 
 
 def damage(path: Path) -> str:
@@ -384,7 +375,7 @@ def open_result(path: Path) -> xr.Dataset:
     path = path.expanduser()
     if not path.exists():
         raise InputError(f"file = {str(path)!r}: does not exist; give a result written by `drivetrain run`")
-    read_attribute(path, "digest")
+    attributes(path)
     try:
         with xr.open_dataset(path, engine="h5netcdf", phony_dims="sort") as dataset:
             result = dataset.load()

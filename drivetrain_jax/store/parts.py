@@ -24,50 +24,12 @@ from drivetrain_jax.store.files import behind_link, sync_folder, write_atomic
 Arrays = Mapping[str, np.ndarray]
 
 
-class BlockFiles:
-    """Finished blocks as files in a folder, each with the digest of its bytes in its name; damaged ones do not count."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    @property
-    def place(self) -> str:
-        """The folder, under the name by which workers find it."""
-        return os.path.abspath(self._folder)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return BlockFiles, (Path(self.place),)
-
-    def numbers(self) -> list[int]:
-        """Numbers of the blocks that have a file, damaged ones included."""
-        return sorted({int(path.name[:8]) for path in self._folder.glob("*-*.npz")})
-
-    def write(self, number: int, results: Arrays) -> None:
-        """Store the results of a block."""
-        file = io.BytesIO()
-        np.savez(file, **results)  # pyright: ignore[reportArgumentType]
-        data = file.getbuffer()
-        path = self._folder / f"{number:08d}-{_digest(data)}.npz"
-        write_atomic(path, data, path.with_suffix(f".{os.getpid()}.tmp"))
-
-    def read(self, number: int) -> Arrays | None:
-        """The results of a block; None if it is missing or damaged."""
-        for path in self._folder.glob(f"{number:08d}-*.npz"):
-            # Content with the digest of its name may still be no archive, for which NumPy raises exceptions of many kinds.
-            with suppress(Exception):
-                data = path.read_bytes()
-                if _digest(data) == path.stem.partition("-")[2]:
-                    with np.load(io.BytesIO(data)) as file:
-                        return dict(file)
-        return None
-
-
-def _digest(data: bytes | memoryview) -> str:
-    return hashlib.blake2b(data, digest_size=16).hexdigest()
-
-
 class PartsFolder:
-    """The folder beside the result ``out``. Writing needs an open folder (``open``, ``close``), reading does not."""
+    """The folder beside the result ``out``. Changing it needs an open folder (``open``, ``close``), reading does not.
+
+    Each finished block is a file with the digest of its bytes in its name; damaged ones do not count. Workers receive the
+    folder, which they must see under the same name.
+    """
 
     def __init__(self, out: Path) -> None:
         # All links to a file share one folder, and so one lock.
@@ -75,9 +37,39 @@ class PartsFolder:
         self.out, self.path = out, out.parent / f"{out.name}.parts"
         # Path at which the result grows.
         self.result = self.path / "result.tmp"
-        self.blocks = BlockFiles(self.path)
         self._plan = self.path / "plan.json"
         self._lock: FileLock | None = None
+
+    @property
+    def place(self) -> str:
+        """The folder, under the name by which workers find it."""
+        return os.path.abspath(self.path)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return PartsFolder, (Path(os.path.abspath(self.out)),)
+
+    def numbers(self) -> list[int]:
+        """Numbers of the blocks that have a file, damaged ones included."""
+        return sorted({int(path.name[:8]) for path in self.path.glob("*-*.npz")})
+
+    def write(self, number: int, results: Arrays) -> None:
+        """Store the results of a block."""
+        file = io.BytesIO()
+        np.savez(file, **results)  # pyright: ignore[reportArgumentType]
+        data = file.getbuffer()
+        path = self.path / f"{number:08d}-{_digest(data)}.npz"
+        write_atomic(path, data, path.with_suffix(f".{os.getpid()}.tmp"))
+
+    def read(self, number: int) -> Arrays | None:
+        """The results of a block; None if it is missing or damaged."""
+        for path in self.path.glob(f"{number:08d}-*.npz"):
+            # Content with the digest of its name may still be no archive, for which NumPy raises exceptions of many kinds.
+            with suppress(Exception):
+                data = path.read_bytes()
+                if _digest(data) == path.stem.partition("-")[2]:
+                    with np.load(io.BytesIO(data)) as file:
+                        return dict(file)
+        return None
 
     def plan(self) -> dict[str, Any]:
         """The plan of the blocks; empty without a readable plan.
@@ -148,6 +140,10 @@ class PartsFolder:
         self._lock = None
 
 
+def _digest(data: bytes | memoryview) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()
+
+
 Place = tuple[slice, ...]
 
 
@@ -189,9 +185,5 @@ class Shards:
 
     def starts(self, path: int | None) -> np.ndarray:
         """Number of the first point of every shard, and of all points; with a ``path`` axis these are lines along it."""
-        axes = [axis for axis in range(len(self.shape)) if axis != path]
-        if not axes:
-            return np.array([0, 1])
-        at, lines = np.unravel_index(np.arange(self.count), self._counts), [self.shape[axis] for axis in axes]
-        firsts = np.ravel_multi_index([at[axis] * self.lengths[axis] for axis in axes], lines)
-        return np.append(firsts, math.prod(lines))
+        boxes = ([part.stop - part.start for part in self.place(shard)] for shard in range(self.count))
+        return np.cumsum([0, *(math.prod(box) // (1 if path is None else box[path]) for box in boxes)])

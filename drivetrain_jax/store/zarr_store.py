@@ -150,11 +150,6 @@ def attributes(path: Path) -> dict[str, Any]:
         raise InputError(f"store = {str(path)!r}: not a readable Zarr store; give one of --store zarr") from None
 
 
-def read_attribute(path: Path, name: str) -> Any:
-    """One of :func:`attributes`, None if it is missing."""
-    return attributes(path).get(name)
-
-
 def seal(path: Path, attrs: Mapping[str, Any], labels: Mapping[str, Mapping[str, Any]]) -> None:
     """Write the attributes of the finished store and the ``labels`` of variables, and add the digest of everything else."""
     # Temporary files of workers that were killed.

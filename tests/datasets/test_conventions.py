@@ -22,7 +22,7 @@ from drivetrain_jax.report.statements import axes_table, statements
 from drivetrain_jax.runs import job
 from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.scene import Problem, result_variables
-from drivetrain_jax.store.consolidate import read_attribute
+from drivetrain_jax.store.consolidate import attributes
 
 SCENES = sorted((Path(__file__).parents[2] / "sweeps").glob("*.toml"))
 
@@ -166,7 +166,7 @@ def test_cf(result, checker):
     assert dataset.attrs["source"] == f"drivetrain_jax {dt.__version__}"
     assert dataset.attrs["history"].startswith(f"{dataset.attrs['created']}: ")
     assert dataset.attrs["title"] and dataset.attrs["references"] and dataset.attrs["Conventions"] == "CF-1.11"
-    assert "numerics_detail" not in dataset.attrs and read_attribute(result, "numerics_detail")
+    assert "numerics_detail" not in dataset.attrs and attributes(result).get("numerics_detail")
     assert len(repr(dataset)) < 8000
 
 

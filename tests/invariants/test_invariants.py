@@ -216,7 +216,7 @@ def test_verify_unfinished_work(tmp_path):
     folder.open()
     folder.start({"digest": "abc"})
     for number in (0, 1):
-        folder.blocks.write(number, {"outcome": np.zeros(2, np.int8)})
+        folder.write(number, {"outcome": np.zeros(2, np.int8)})
     folder.close()
     report = verify(tmp_path / "r.nc")
     assert (report.problem, report.complete) == ("", False) and report.lines == (

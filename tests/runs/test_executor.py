@@ -25,7 +25,7 @@ from drivetrain_jax.runs.job import Block
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.runs.work import Threads, make_executor, run_threads
-from drivetrain_jax.store.parts import BlockFiles
+from drivetrain_jax.store.parts import PartsFolder
 
 HERE = Path(__file__).parent
 DELTA = {"start": 0.1, "stop": 2.0, "num": 3000}
@@ -204,7 +204,8 @@ def test_a_worker_of_another_kind_is_refused_before_it_computes(grid_scene, monk
 @pytest.mark.usefixtures("small_blocks")
 def test_a_worker_stores_its_block_and_returns_outcomes(grid_scene, tmp_path):
     job = resolve(load_scene(grid_scene))
-    store = BlockFiles(tmp_path)
+    store = PartsFolder(tmp_path / "r.nc")
+    store.path.mkdir()
     copy, stored = pickle.loads(pickle.dumps((job, store)))
     block = Block(1, np.array([25, 27]))
     assert list(work.compute(copy, stored, job.digest, block, 7)) == ["outcome"]

@@ -31,7 +31,7 @@ def test_finished_points_have_values_and_others_are_pending(grid_scene, tmp_path
     seen = []
 
     def look(progress):
-        if progress.computed and not seen and PartsFolder(path).blocks.numbers():
+        if progress.computed and not seen and PartsFolder(path).numbers():
             seen.append(dt.open_result(path))
 
     run_to_file(grid_scene, path, executor=Threads(1), report=look)

@@ -383,7 +383,7 @@ def test_a_whole_block_of_other_content_is_computed_again(tmp_path, other):
     scene = {"system": "toy", "analysis": "toy", "outputs": ["value"], "axes": axes}
     with pytest.raises(KeyboardInterrupt):
         run_to_file(scene, path, executor=Threads(1), report=stop_after(1))
-    blocks = PartsFolder(path).blocks
+    blocks = PartsFolder(path)
     for number in blocks.numbers():
         next(Path(f"{path}.parts").glob(f"{number:08d}-*")).unlink()
         blocks.write(number, other)
@@ -498,7 +498,7 @@ def test_fresh_does_not_resume_parts_of_the_present_result(grid_scene, tmp_path,
             short.setattr(PartsFolder, "close", killed)
             with pytest.raises(KeyboardInterrupt):
                 run_to_file(grid_scene, path, fresh=True)
-        assert PartsFolder(path).blocks.numbers()
+        assert PartsFolder(path).numbers()
 
     fresh_but_for_the_end()
     assert run_to_file(grid_scene, path, fresh=True).computed == 123

@@ -21,7 +21,7 @@ from drivetrain_jax.runs.output import status
 from drivetrain_jax.runs.run import Incomplete, Interrupted, run, run_to_file
 from drivetrain_jax.runs.work import Threads
 from drivetrain_jax.store import zarr_store
-from drivetrain_jax.store.consolidate import read_attribute
+from drivetrain_jax.store.consolidate import attributes
 from tests.sizes import full_after
 
 pytest.importorskip("zarr")
@@ -71,7 +71,7 @@ def test_export_is_bit_identical_to_the_file(grid_scene, tmp_path, which):
     ours, exported = opened(tmp_path / "direct.nc"), opened(tmp_path / "exported.nc")
     identical(ours, exported)
     # A later version can then report differences, and can extend either file.
-    details = [read_attribute(tmp_path / name, "numerics_detail") for name in ("direct.nc", "exported.nc")]
+    details = [attributes(tmp_path / name)["numerics_detail"] for name in ("direct.nc", "exported.nc")]
     assert details[0] == details[1] is not None
     assert verify(tmp_path / "exported.nc").problem == "" == verify(tmp_path / "r.zarr").problem
     assert sorted(p.name for p in tmp_path.iterdir()) == ["direct.nc", "exported.nc", "r.zarr"]
