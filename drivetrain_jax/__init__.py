@@ -116,8 +116,9 @@ def _register_accessor() -> None:
     """Give every Dataset of xarray, which is imported, the accessor ``drivetrain``."""
     xr = sys.modules["xarray"]
     if not hasattr(xr.Dataset, "drivetrain"):
-        accessor = import_module(f"{__name__}.datasets.accessor").DrivetrainAccessor
-        xr.register_dataset_accessor("drivetrain")(accessor)
+        # Imported at the first use: the module of the accessor may be the one that imports xarray.
+        module = f"{__name__}.datasets.accessor"
+        xr.register_dataset_accessor("drivetrain")(lambda dataset: import_module(module).DrivetrainAccessor(dataset))
 
 
 class _AfterXarray:

@@ -108,12 +108,15 @@ class AtlasQuery:
                 raise InputError(f"{name} = {as_given(value)}: is the answer; {allowed}")
         for name in (*ranges, *free):
             if name not in atlas.parameters:
-                raise InputError(
-                    f"file: the atlas does not vary {name}; allowed is one over {', '.join((*ranges, *free))}"
-                )
+                behind = {n: known[0].name for n in (*ranges, *free) if shaft and (known := shaft.back(n))}
+                over = ", ".join(behind.get(n, n) for n in (*ranges, *free))
+                raise InputError(f"file: the atlas does not vary {behind.get(name, name)}; expected one over {over}")
         for name, value in values.items():
             if name in atlas.fixed and name not in free:
                 source = shaft.physical.source(name) if shaft and name not in given else ""
+                made = shaft.quantity(name, atlas.fixed[name]) if shaft and source else None
+                if made and made[0] in given and not isinstance(value, tuple) and (typed := shaft.quantity(name, value)):
+                    check_same(made[0], typed[1], made[1], units=made[2])
                 check_same(name, value, atlas.fixed[name], source)
         kept = {name for name in atlas.parameters if name not in free or name in within}
         kept_values = {name: atlas.ranges[name] for name in ranges}

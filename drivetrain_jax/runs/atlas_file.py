@@ -44,15 +44,15 @@ View = tuple[Parameter, Callable[[Any], Any]]
 SAME_FIXED = 5e-4
 
 
-def check_same(name: str, value: Any, fixed: float, source: str = "") -> None:
+def check_same(name: str, value: Any, fixed: float, source: str = "", units: str = "1") -> None:
     """Raise :class:`InputError` unless ``value`` is the ``fixed`` one of the atlas, which may be typed with four digits.
 
     ``source`` names the physical data from which it follows.
     """
     if isinstance(value, tuple) or not np.allclose(value, fixed, rtol=SAME_FIXED, atol=0):
-        made = f"the atlas is made for {name} = {fixed:.10g}"
-        written = f"{name} = {as_given(value)}" + (f" (from {source})" if source else "")
-        raise InputError(f"{written}: {made}; allowed is that value")
+        unit = "" if units == "1" else f" {units}"
+        written = f"{name} = {as_given(value)}{unit}" + (f" (from {source})" if source else "")
+        raise InputError(f"{written}: the atlas is made for {name} = {fixed:.6g}{unit}; expected that value")
 
 
 def as_given(value: Any) -> str:
