@@ -75,6 +75,6 @@ def meant(name: str, parameters: Iterable[Any]) -> str:
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str:
-    """``(did you mean X?); allowed is A, B, ...``"""
+    """``(did you mean X?); expected A, B, ...``"""
     allowed = list(allowed)
-    return f"{did_you_mean(name, allowed)}; allowed is {', '.join(allowed) if allowed else 'none'}"
+    return f"{did_you_mean(name, allowed)}; expected {', '.join(allowed) if allowed else 'none'}"

@@ -54,7 +54,7 @@ def call_plugin(
     # Code of another package may raise anything.
     except Exception as error:
         text = " ".join(str(error).split())
-        raise InputError(f"{what} {entry} raised {type(error).__name__}: {text}; allowed is {allowed}") from error
+        raise InputError(f"{what} {entry} raised {type(error).__name__}: {text}; expected {allowed}") from error
     if not isinstance(result, kind):
-        raise InputError(f"{what} {entry} returned {type(result).__name__}; allowed is {allowed}")
+        raise InputError(f"{what} {entry} returned {type(result).__name__}; expected {allowed}")
     return result

@@ -98,15 +98,15 @@ class Parameter:
             # A word that looks like a number needs no quotes.
             value = str(value) if isinstance(value, int) and str(value) in self.choices else value
             if not isinstance(value, str) or value not in self.choices:
-                raise InputError(f"{self.name} = {shown(value)}: allowed is {self.allowed}")
+                raise InputError(f"{self.name} = {shown(value)}: expected {self.allowed}")
             return value
         if self.text:
             if not isinstance(value, str):
-                raise InputError(f"{self.name} = {shown(value)}: allowed is text")
+                raise InputError(f"{self.name} = {shown(value)}: expected text")
             return value
         if self.listed and not (self.broadcast and not isinstance(value, (list, tuple))):
             if not isinstance(value, (list, tuple)) or not value:
-                raise InputError(f"{self.name} = {shown(value)}: allowed is a list of numbers, {self.allowed}")
+                raise InputError(f"{self.name} = {shown(value)}: expected a list of numbers, {self.allowed}")
             return tuple(self._check_number(entry, f"{self.name}[{i}]") for i, entry in enumerate(value))
         return self._check_number(value, self.name)
 
@@ -119,12 +119,12 @@ class Parameter:
         elif isinstance(value, Decimal) or (isinstance(value, Real) and not isinstance(value, (bool, int, float))):
             value = float(value)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise InputError(f"{label} = {shown(value)}: allowed is a number, {self.allowed}")
+            raise InputError(f"{label} = {shown(value)}: expected a number, {self.allowed}")
         if isinstance(value, int) and value.bit_length() > 1024:
-            raise InputError(f"{label}: an integer of {value.bit_length()} bits; allowed is {self.allowed_in_units}")
+            raise InputError(f"{label}: an integer of {value.bit_length()} bits; expected {self.allowed_in_units}")
         if not self._is_within(value) or (self.integer and value != int(value)):
             guess = "" if written else self._meant(value)
-            raise InputError(f"{label} = {value!r}: allowed is {self.allowed_in_units}{guess}")
+            raise InputError(f"{label} = {value!r}: expected {self.allowed_in_units}{guess}")
         if value > self.usual:
             usual = f"more than {self.usual:g} {self.units}"
             warnings.warn(f'{label} = {value:.10g} {self.units}: {usual}; is "{value:.10g} mm" meant?', stacklevel=2)
@@ -143,10 +143,10 @@ class Parameter:
             return _units.number(text, self.units)
         except _units.UnitError as error:
             if _units.split(text) is None:
-                raise InputError(f"{label} = {shown(text)}: allowed is a number, {self.allowed}") from None
+                raise InputError(f"{label} = {shown(text)}: expected a number, {self.allowed}") from None
             error = f"{error}{_units.misread(text)}"
             unit = "a number without unit" if self.units == "1" else f"a number in {self.units} or in a unit like it"
-            raise InputError(f"{label} = {shown(text)}: {error}; allowed is {unit}, {self.allowed}") from None
+            raise InputError(f"{label} = {shown(text)}: {error}; expected {unit}, {self.allowed}") from None
 
     def _meant(self, value: float) -> str:
         """A question, if ``value`` would be in the range as an angle in degrees."""

@@ -30,7 +30,7 @@ class Rule:
 
     def __post_init__(self) -> None:
         if isinstance(self.variables, str):
-            raise TypeError(f"variables = {self.variables!r}: allowed is a tuple of names, ({self.variables!r},)")
+            raise TypeError(f"variables = {self.variables!r}: expected a tuple of names, ({self.variables!r},)")
 
 
 def within(name: str, lower: float = -np.inf, upper: float = np.inf) -> Rule:
@@ -117,7 +117,7 @@ class Declared:
 
     def __post_init__(self) -> None:
         if not isinstance(self.rules, tuple) or not all(isinstance(rule, Rule) for rule in self.rules):
-            raise TypeError(f"rules: got {shown(self.rules)}; allowed is a tuple of rules, (rule, ...)")
+            raise TypeError(f"rules: got {shown(self.rules)}; expected a tuple of rules, (rule, ...)")
 
 
 # Error of a radius that is known to be 1: four roundings.

@@ -113,20 +113,20 @@ def model_and_analysis(name: str, system: Any) -> tuple[Model, Analysis]:
     """The model of ``system`` for the analysis ``name``, and this analysis for its class; ``InputError`` without one."""
     if not isinstance(system, System):
         kind = f"the class {system.__name__}" if isinstance(system, type) else f"a {type(system).__name__}"
-        raise InputError(f"system: got {kind}; allowed is a system such as drivetrain_jax.Cardan(...)")
+        raise InputError(f"system: got {kind}; expected a system such as drivetrain_jax.Cardan(...)")
     try:
         # The model first: only a system with one declares what the analysis takes from its class.
         return get_analysis(name).model(type(system)), get_analysis(name).for_system(type(system))
     except KeyError:
         known = analyses_of(type(system))
         guess = did_you_mean(name, known)
-        raise InputError(f"{name}: unknown to {system.name}{guess}; allowed is one of {', '.join(known)}") from None
+        raise InputError(f"{name}: unknown to {system.name}{guess}; expected one of {', '.join(known)}") from None
 
 
 def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapping[str, Any]) -> tuple[_Job, Any]:
     """The checked call, and its numbers as arrays."""
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        raise InputError("jax_enable_x64 = False: allowed is True, by jax.config.update or within jax.enable_x64(True)")
+        raise InputError("jax_enable_x64 = False: expected True, by jax.config.update or within jax.enable_x64(True)")
     model, analysis = model_and_analysis(name, system)
     values = {key: value for key, value in system.values.items() if key in model.parameters}
     try:
@@ -146,7 +146,7 @@ def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapp
     path = None if along is None else np.atleast_1d(np.asarray(leaf, float))
     parameters = jax.tree.map(lambda x: None if isinstance(x, str) or x is leaf else jnp.asarray(x, float), values)
     if batch := next((x.shape for x in jax.tree.leaves(parameters) if x.ndim), None):
-        allowed = "allowed is one system, or a batch under jax.vmap"
+        allowed = "expected one system, or a batch under jax.vmap"
         raise InputError(f"{name}: parameters of the shape {batch}; {allowed}")
     rest = jax.tree.map(lambda x: x if isinstance(x, str) else path if x is leaf else None, values)
     single = along is not None and np.ndim(leaf) == 0  # pyright: ignore[reportArgumentType]

@@ -77,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (RuntimeError, AssertionError):
         if not _lacks_platform():
             raise
-        allowed = "jax cannot use it on this machine; allowed is cpu, or to unset the variable"
+        allowed = "jax cannot use it on this machine; set cpu, or unset the variable"
         sys.stderr.write(one_line(f"JAX_PLATFORMS = {os.environ['JAX_PLATFORMS']!r}: {allowed}"))
         return WRONG_INPUT
     except KeyboardInterrupt:
@@ -253,13 +253,13 @@ def assignments(texts: Sequence[str], field: str) -> dict[str, Any]:
     for text in texts:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not (name and equals and value):
-            raise InputError(f"{field} = {text!r}: allowed is name=value")
+            raise InputError(f"{field} = {text!r}: expected name=value")
         if name in pairs:
-            raise InputError(f"{field} = {text!r}: {name} is given twice; allowed is once")
+            raise InputError(f"{field} = {text!r}: {name} is given twice; expected once")
         pairs[name] = parse_value(value)
     for name in pairs:
         if table := next((other for other in pairs if name.startswith(f"{other}.")), None):
-            raise InputError(f"{field} = {name!r}: it is part of {table!r}, which is given too; allowed is one of them")
+            raise InputError(f"{field} = {name!r}: it is part of {table!r}, which is given too; expected one of them")
     return pairs
 
 
@@ -280,7 +280,7 @@ def _number_or_range(name: str, value: Any) -> Any:
             return numbers[0] if len(numbers) == 1 else tuple(numbers)
     elif isinstance(value, (int, float)) and not isinstance(value, bool):
         return float(value)
-    raise InputError(f"{name} = {value!r}: allowed is a number or LOW:HIGH, with or without units (200:4000rpm)")
+    raise InputError(f"{name} = {value!r}: expected a number or LOW:HIGH, with or without units (200:4000rpm)")
 
 
 # Commands.
@@ -422,12 +422,12 @@ def export(options: argparse.Namespace) -> int:
         from drivetrain_jax.datasets.accessor import write_csv
 
         if options.file:
-            raise InputError(f"FILE.nc = {str(options.file)!r}: not used with --csv; allowed is --csv TABLE.csv")
+            raise InputError(f"FILE.nc = {str(options.file)!r}: not used with --csv; expected --csv TABLE.csv")
         out = Path(options.csv or options.store.with_suffix(".csv"))
         _check_place(out, (".csv",))
         count = write_csv(options.store, out)
     elif options.file is None:
-        raise InputError("FILE.nc: missing; allowed is a new file, or --csv for a table")
+        raise InputError("FILE.nc: missing; expected a new file, or --csv for a table")
     else:
         from drivetrain_jax.runs.assemble import export
 
@@ -445,7 +445,7 @@ def plot(options: argparse.Namespace) -> int:
     ending, image = options.out.suffix.lower(), io.BytesIO()
     part = ranges(options.part, "--part") or None
     if ending in _TABLES and (len(options.files) > 1 or part or options.cells is not None):
-        raise InputError(f"out = {str(options.out)!r}: a table shows one whole result; allowed are figures")
+        raise InputError(f"out = {str(options.out)!r}: a table shows one whole result; expected figures")
     with _reading(*options.files):
         if ending in _TABLES:
             return _write(options.out, table(options.files[0], options.units, _TABLES[ending]).encode())
@@ -485,12 +485,12 @@ def explore(options: argparse.Namespace) -> int:
 def _check_place(out: Path, endings: tuple[str, ...]) -> None:
     """Raise :class:`InputError` for a file that could not be written, before anything is computed."""
     if not out.parent.is_dir():
-        raise InputError(f"out = {str(out)!r}: the folder does not exist; allowed is a file in an existing folder")
+        raise InputError(f"out = {str(out)!r}: the folder does not exist; expected a file in an existing folder")
     if out.exists() and not out.is_file():
         what = "is a folder" if out.is_dir() else "not a regular file"
-        raise InputError(f"out = {str(out)!r}: {what}; allowed is a new file, or one to replace")
+        raise InputError(f"out = {str(out)!r}: {what}; expected a new file, or one to replace")
     if out.suffix.lower() not in endings:
-        raise InputError(f"out = {str(out)!r}: allowed is a name that ends in {', '.join(endings)}")
+        raise InputError(f"out = {str(out)!r}: expected a name that ends in {', '.join(endings)}")
 
 
 def _write(out: Path, data: bytes | memoryview) -> int:
@@ -509,7 +509,7 @@ def point(options: argparse.Namespace) -> int:
     for name in ("system", "analysis", *asked):
         if name in values:
             option = f"not a parameter; did you mean the option --{name}?"
-            twice = "given twice; allowed is once, in front of the values"
+            twice = "given twice; expected once, in front of the values"
             raise InputError(f"{name} = {values[name]!r}: {option if name in asked else twice}")
     outputs = values.pop("outputs", None)
     if isinstance(outputs, str):
@@ -552,7 +552,7 @@ def bench(options: argparse.Namespace) -> int:
 
     checkout = Path(__file__).resolve().parents[1]
     if not (checkout / "benchmarks" / "__main__.py").is_file():
-        raise InputError(f"bench: no folder benchmarks/ in {str(checkout)!r}; allowed is a checkout")
+        raise InputError(f"bench: no folder benchmarks/ in {str(checkout)!r}; expected a checkout")
     words = [*options.systems, *(["--quick"] if options.quick else [])]
     words += ["--out", str(options.out.absolute())] if options.out else []
     return subprocess.run([sys.executable, "-m", "benchmarks", *words], cwd=checkout, check=False).returncode

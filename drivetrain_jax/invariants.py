@@ -199,10 +199,10 @@ def _verify_file(path: Path) -> Report:
     damaged = checksums.damaged(path)
     if damaged:
         names = checksums.named(damaged)
-        problem = f"{names}: damaged; allowed is to restore the file or to compute it again"
+        problem = f"{names}: damaged; restore the file or compute it again"
         return Report((f"checksums: {len(damaged)} differ: {names}",), problem)
     if damaged is None and "digest" in attributes(path):
-        problem = "its checksums are gone; allowed is to restore the file or to compute it again"
+        problem = "its checksums are gone; restore the file or compute it again"
         return Report(("checksums: gone",), problem)
     sealed = "none in this file" if damaged is None else "all agree"
     findings = check(open_result(path))
@@ -215,7 +215,7 @@ def verify_dataset(dataset: xr.Dataset, file: Path | None) -> Report:
     findings = check(dataset)
     changed = checksums.damaged(file) if file else None
     if changed:
-        remedy = "allowed is to restore the file or to compute it again"
+        remedy = "restore the file or compute it again"
         problem = f"file = {str(file)!r}: {checksums.named(changed)}: damaged; {remedy}"
         return Report((f"checksums: {len(changed)} differ: {checksums.named(changed)}", *map(str, findings)), problem)
     sealed = "not of a file" if changed is None else f"all agree in {file}"
@@ -223,17 +223,17 @@ def verify_dataset(dataset: xr.Dataset, file: Path | None) -> Report:
 
 
 def _first_broken(findings: list[Finding]) -> str:
-    return next((f"{finding}; allowed is none" for finding in findings if finding.broken), "")
+    return next((f"{finding}; expected none" for finding in findings if finding.broken), "")
 
 
 def _verify_store(path: Path) -> Report:
     if not zarr_store.is_sealed(path):
         what = "attributes of the store"
-        problem = f"{what}: damaged; allowed is to restore them or to compute the store again"
+        problem = f"{what}: damaged; restore them or compute the store again"
         return Report((f"checksums: {what} differ",), problem)
     intact = list(zarr_store.intact(path))
     wrong, count = intact.count(False), len(intact)
-    problem = f"{wrong} of {count} shards are damaged; allowed is to compute them again" if wrong else ""
+    problem = f"{wrong} of {count} shards are damaged; compute them again" if wrong else ""
     rules = "rules: applied to the file that `drivetrain export` makes of the store"
     return Report((f"checksums: {wrong or 'none'} of {count} shards differ", rules), problem)
 

@@ -282,5 +282,5 @@ def operating_range(options: Mapping[str, Any]) -> tuple[float, float] | None:
     """
     low, high = (options.get(f"operating_{end}", 0.0) for end in ("min", "max"))
     if high < low:
-        raise InputError(f"options.operating_max = {high:g}: allowed is a speed of at least operating_min = {low:g}")
+        raise InputError(f"options.operating_max = {high:g}: expected a speed of at least operating_min = {low:g}")
     return (low, high) if high > 0 else None

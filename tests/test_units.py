@@ -146,9 +146,9 @@ def test_values_bring_their_units(bring):
 
 
 def test_degrees_without_a_unit_are_refused_with_a_question():
-    with pytest.raises(dt.InputError, match=r'^beta = 18: allowed is .*, in rad; did you mean "18 deg"\?$'):
+    with pytest.raises(dt.InputError, match=r'^beta = 18: expected .*, in rad; did you mean "18 deg"\?$'):
         dt.Cardan(beta=18, Omega=1.4, **BASE)
-    with pytest.raises(dt.InputError, match=r"^beta = 95: allowed is .*, in rad$"):
+    with pytest.raises(dt.InputError, match=r"^beta = 95: expected .*, in rad$"):
         dt.Cardan(beta=95, Omega=1.4, **BASE)
 
 

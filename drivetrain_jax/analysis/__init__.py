@@ -76,7 +76,7 @@ def get_analysis(name: str) -> Analysis:
 
     analysis = load_plugin(ANALYSES, name, "an analysis", lambda x: isinstance(x, Analysis))
     if analysis is None:
-        raise KeyError(f"analysis = {name!r}: allowed is one of {', '.join(analysis_names())}")
+        raise KeyError(f"analysis = {name!r}: expected one of {', '.join(analysis_names())}")
     if analysis.uses and analysis.uses not in analysis_names():
         raise ImportError(f"uses = {analysis.uses!r}: no analysis{nearest(analysis.uses, analysis_names())}")
     return analysis

@@ -246,20 +246,20 @@ def make_request(
     Raises :class:`InputError` with one line that names what the system offers.
     """
     if outputs is not None and not isinstance(outputs, Iterable):
-        raise InputError(f"outputs = {shown(outputs)}: allowed is a list of names")
+        raise InputError(f"outputs = {shown(outputs)}: expected a list of names")
     lacking = analysis.lacks(system)
     names = [v.name for v in analysis.variables]
     offered = [name for name in names if name not in lacking]
     wanted = [name for name in analysis.default_outputs if name not in varies] if outputs is None else outputs
     for name in wanted:
         if name in names and name in varies:
-            raise InputError(f"outputs: {name!r} varies in this scene; allowed is to leave it out")
+            raise InputError(f"outputs: {name!r} varies in this scene; leave it out")
         if name not in names and name != OUTCOME.name:
             raise InputError(f"outputs: {name!r} is not a result of {analysis.name}{nearest(name, offered)}")
     # The outcome is always a result.
     wanted = [name for name in wanted if name != OUTCOME.name]
     if not wanted or len(set(wanted)) < len(wanted):
-        raise InputError(f"outputs = {shown(outputs)}: allowed is one or more of {', '.join(offered)}, each once")
+        raise InputError(f"outputs = {shown(outputs)}: expected one or more of {', '.join(offered)}, each once")
     request = Request(tuple(wanted), *_method_and_options(analysis, dict(options), lacking))
     for key, name, known in (
         ("options.method", request.method, analysis.methods),
@@ -267,7 +267,7 @@ def make_request(
     ):
         if name in lacking:
             allowed = ", ".join(other for other in known if other not in lacking)
-            raise InputError(f"{key} = {name!r}: {lacking[name]}; allowed is {allowed}")
+            raise InputError(f"{key} = {name!r}: {lacking[name]}; expected {allowed}")
     return request
 
 
@@ -317,14 +317,14 @@ class _CheckedSolve:
         wanted = (*(self.analysis.variable(name) for name in self.request.outputs), OUTCOME)
         names = [variable.name for variable in wanted]
         if not isinstance(results, Mapping):
-            raise self._error(f"solve returned {type(results).__name__}; allowed is a dict of {', '.join(names)}")
+            raise self._error(f"solve returned {type(results).__name__}; expected a dict of {', '.join(names)}")
         declared = [*(variable.name for variable in self.analysis.variables), OUTCOME.name]
         for name in results:
             if name not in declared:
                 raise self._error(f"solve returned {name!r}, which is not declared{nearest(str(name), declared)}")
         for name in names:
             if name not in results:
-                raise self._error(f"solve returned {', '.join(results)}, not {name}; allowed is {', '.join(names)}")
+                raise self._error(f"solve returned {', '.join(results)}, not {name}; expected {', '.join(names)}")
         return {variable.name: self._checked(variable, results[variable.name]) for variable in wanted}
 
     def _checked(self, variable: Variable, value: Any) -> Array:
@@ -335,10 +335,10 @@ class _CheckedSolve:
             array = jnp.asarray(value)
         except (TypeError, ValueError):
             kind = type(value).__name__
-            raise self._error(f"{variable.name} is of type {kind}; allowed is an array ({text})") from None
+            raise self._error(f"{variable.name} is of type {kind}; expected an array ({text})") from None
         fits = all(size in {0, length} for size, length in zip(sizes, array.shape, strict=False))
         if not fits or array.ndim - len(dims) not in {0, 1}:
-            raise self._error(f"{variable.name} has the shape {array.shape}; allowed is ({text})")
+            raise self._error(f"{variable.name} has the shape {array.shape}; expected ({text})")
         return array
 
     def _error(self, text: str) -> InputError:
@@ -359,7 +359,7 @@ def _method_and_options(
         if key not in used:
             others = [name for name in methods if key in analysis.methods[name]]
             guess = f", but by {', '.join(others)}" if others else did_you_mean(key, ("method", *used))
-            allowed = f"allowed is {', '.join(('method', *used))}"
+            allowed = f"expected {', '.join(('method', *used))}"
             raise InputError(f"options.{key} = {shown(value)}: not used by method {method}{guess}; {allowed}")
     return method, {o.name: _option(o, options) for o in analysis.options if o.name in used}
 
@@ -368,7 +368,7 @@ def _option(option: Parameter, options: Mapping[str, Any]) -> Any:
     if option.name in options:
         return checked(option, options[option.name], "options.")
     if option.default is None and not option.derived:
-        raise InputError(f"options.{option.name}: missing; allowed is {option.allowed}")
+        raise InputError(f"options.{option.name}: missing; expected {option.allowed}")
     return option.default
 
 
@@ -379,4 +379,4 @@ def checked(parameter: Parameter, value: Any, where: str) -> Any:
     except ValueError as error:
         raise InputError(f"{where}{error}") from None
     except OverflowError:
-        raise InputError(f"{where}{parameter.name} = {shown(value)}: allowed is {parameter.allowed}") from None
+        raise InputError(f"{where}{parameter.name} = {shown(value)}: expected {parameter.allowed}") from None

@@ -60,7 +60,7 @@ def _frequencies(request: Request) -> np.ndarray:
     """The frequencies of the options [Hz]; :class:`InputError` without a range."""
     start, stop, num = (request.options[name] for name in ("start", "stop", "num"))
     if stop <= start:
-        raise InputError(f"options.stop = {stop:g}: allowed is more than start = {start:g}, in Hz")
+        raise InputError(f"options.stop = {stop:g}: expected more than start = {start:g}, in Hz")
     return np.linspace(start, stop, num)
 
 

@@ -462,7 +462,7 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
     operating_range(request.options)
     followed = sorted(_FOLLOWED & set(request.outputs))
     if followed and not request.options["track"]:
-        raise InputError(f"outputs: {followed[0]!r} needs the option track; allowed is the name of an axis")
+        raise InputError(f"outputs: {followed[0]!r} needs the option track; expected the name of an axis")
     springs: SpringSystem = described(system.models["modes"], fixed)
     return (
         Dimension("mode", "number of the mode", tuple(range(1, len(springs.dofs) + 1))),

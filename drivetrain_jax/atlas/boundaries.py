@@ -59,7 +59,7 @@ def boundaries(atlas: Atlas, system: type[System], searches: Sequence[Search] = 
     """
     atlas = atlas.folded()
     if len(atlas.parameters) != 2:
-        raise ValueError(f"parameters = {', '.join(atlas.parameters)}: allowed are two; slice the atlas first")
+        raise ValueError(f"parameters = {', '.join(atlas.parameters)}: expected two; slice the atlas first")
     criteria = Criteria.of(atlas, system)
     patches = patches_of(criteria)
     curves: list[Boundary] = []

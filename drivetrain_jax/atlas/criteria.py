@@ -63,7 +63,7 @@ class Criteria:
     def __post_init__(self) -> None:
         if not self.atlas.panels:
             reason = self.atlas.gaps[0].reason if self.atlas.gaps else "it covers nothing"
-            raise InputError(f"file: the atlas has no panel ({reason}); allowed is one whose solves converged")
+            raise InputError(f"file: the atlas has no panel ({reason}); expected one whose solves converged")
         if not has_boundaries(self.atlas, self.system):
             raise InputError(
                 f"system = {self.system.name!r}: has no boundary functions; allowed for boundaries "

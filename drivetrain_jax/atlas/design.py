@@ -313,7 +313,7 @@ def _over(atlas: Atlas, at: Mapping[str, float], *wanted: str) -> Atlas:
     if set(part.parameters) != set(wanted):
         left = " and ".join(part.parameters) or "nothing"
         raise InputError(
-            f"at = {dict(at)}: leaves an atlas over {left}; allowed are values that leave {' and '.join(wanted)}"
+            f"at = {dict(at)}: leaves an atlas over {left}; expected values that leave {' and '.join(wanted)}"
         )
     return part
 

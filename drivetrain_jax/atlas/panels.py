@@ -143,7 +143,7 @@ class Atlas:
             raise KeyError(f"{name}: the atlas has {', '.join(self.parameters)}")
         k = self.parameters.index(name)
         if not self.lower[k] <= value <= self.upper[k]:
-            raise ValueError(f"{name} = {value!r}: allowed is {self.lower[k]:g} to {self.upper[k]:g}")
+            raise ValueError(f"{name} = {value!r}: expected {self.lower[k]:g} to {self.upper[k]:g}")
         x = float(self.coordinates[k].forward(value))
         boxes = [box for box in (*self.panels, *self.gaps) if between(box.lower[k], box.upper[k], x)]
         # On a common face the first of two neighbours is used.

@@ -255,7 +255,7 @@ def _axis_of_resonances(atlas: Atlas, system: type[System]) -> int:
     axis = system.resonances.axis if system.resonances else ""
     if len(atlas.parameters) != 2 or axis not in atlas.parameters:
         names = ", ".join(atlas.parameters)
-        raise ValueError(f"parameters = {names}: allowed are two, one of them {axis or 'the axis of resonances'}")
+        raise ValueError(f"parameters = {names}: expected two, one of them {axis or 'the axis of resonances'}")
     return atlas.parameters.index(axis)
 
 

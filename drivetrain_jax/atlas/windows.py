@@ -162,7 +162,7 @@ def narrow(atlas: Atlas, bounds: Mapping[str, tuple[float, float]]) -> Atlas:
             raise KeyError(f"{name}: the atlas has {', '.join(atlas.parameters)}")
         k = atlas.parameters.index(name)
         if not lower[k] <= a < b <= upper[k]:
-            raise ValueError(f"{name} = {a!r} to {b!r}: allowed is a range within {lower[k]:g} to {upper[k]:g}")
+            raise ValueError(f"{name} = {a!r} to {b!r}: expected a range within {lower[k]:g} to {upper[k]:g}")
         lower[k], upper[k] = a, b
     part = replace(atlas, lower=lower, upper=upper).folded()
     corners = part.corners

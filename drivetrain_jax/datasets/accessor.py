@@ -50,7 +50,7 @@ class DrivetrainAccessor:
 
         self._analysis()
         if "outcome" in self._dataset and self._dataset["outcome"].dtype.kind not in "iu":
-            raise InputError("outcome: no codes; allowed is the result itself, as before .named() or a mean")
+            raise InputError("outcome: no codes; expected the result itself, as before .named() or a mean")
         try:
             return verify_dataset(self._dataset, self._file())
         except InputError:
@@ -91,7 +91,7 @@ class DrivetrainAccessor:
         self._analysis()
         predicted = resonances(self._dataset)
         if predicted is None:
-            raise InputError("resonances: none are predicted along these axes; allowed is a chart that has some")
+            raise InputError("resonances: none are predicted along these axes; expected a chart that has some")
         return predicted
 
     def orders(self) -> xr.DataArray:
@@ -113,7 +113,7 @@ class DrivetrainAccessor:
         name = next((name for name in FREQUENCIES if name in self._dataset), None)
         if orders is None or name is None:
             raise InputError(
-                "orders: not known; allowed is a result with frequencies, of a planetary gear with its teeth"
+                "orders: not known; expected a result with frequencies, of a planetary gear with its teeth"
             )
         frequency = self._dataset[name]
         order = xr.DataArray(list(orders.per_turn), dims="order", name="order", attrs={"long_name": "order"})
@@ -155,7 +155,7 @@ class DrivetrainAccessor:
     def _analysis(self) -> str:
         analysis = self._dataset.attrs.get("analysis")
         if analysis is None:
-            raise InputError("dataset: has no attribute 'analysis'; allowed is a result of drivetrain_jax")
+            raise InputError("dataset: has no attribute 'analysis'; expected a result of drivetrain_jax")
         return analysis
 
     def _atlas(self, method: str) -> StoredAtlas:
@@ -235,9 +235,7 @@ def write_csv(source: Path, out: Path) -> int:
 
     dataset = open_result(source)
     if dataset.attrs.get("analysis") == "atlas" or "outcome" not in dataset:
-        raise InputError(
-            f"file = {str(source)!r}: holds no values on a grid; allowed is a chart of it, saved as a file"
-        )
+        raise InputError(f"file = {str(source)!r}: holds no values on a grid; expected a chart of it, saved as a file")
     temporary = out.with_name(f"{out.name}.tmp")
     try:
         table = pd.DataFrame({name: np.ravel(values) for name, values in _columns(dataset)})

@@ -80,9 +80,9 @@ class AtlasEntrypoint(BackendEntrypoint):
         """
         if not isinstance(filename_or_obj, (str, os.PathLike)):
             kind = type(filename_or_obj).__name__
-            raise InputError(f"filename_or_obj: got a {kind}; allowed is the path of the file of an atlas")
+            raise InputError(f"filename_or_obj: got a {kind}; expected the path of the file of an atlas")
         if gaps not in _GAPS:
-            raise InputError(f"gaps = {shown(gaps)}: allowed is one of {', '.join(_GAPS)}")
+            raise InputError(f"gaps = {shown(gaps)}: expected one of {', '.join(_GAPS)}")
         path = os.path.abspath(os.path.expanduser(os.fspath(filename_or_obj)))
         dropped = {drop_variables} if isinstance(drop_variables, str) else set(drop_variables or ())
         return _on_grid(path, grid, gaps == "solve").drop_vars(dropped, errors="ignore")
@@ -187,14 +187,14 @@ def _grid_values(atlas: StoredAtlas, grid: Any) -> tuple[dict[str, np.ndarray], 
     """
     table = dict.fromkeys(atlas.parameters, grid) if _is_count(grid) else {} if grid is None else grid
     if not isinstance(table, Mapping):
-        raise InputError(f"grid = {shown(grid)}: allowed is a number of values, or a table by the names of parameters")
+        raise InputError(f"grid = {shown(grid)}: expected a number of values, or a table by the names of parameters")
     for name, value in table.items():
         if name not in atlas.parameters:
             atlas.refuse(str(name), value)
     values = {name: _values(atlas, name, table.get(name, _DEFAULT)) for name in atlas.parameters}
     axes = {name: value for name, value in values.items() if value.ndim}
     if not axes:
-        raise InputError("grid: fixes all parameters; allowed is one that varies, and query answers for a point")
+        raise InputError("grid: fixes all parameters; expected one that varies, and query answers for a point")
     return axes, {name: float(value) for name, value in values.items() if not value.ndim}
 
 
@@ -203,7 +203,7 @@ def _values(atlas: StoredAtlas, name: str, entry: Any) -> np.ndarray:
     label = atlas.viewed_as(name)[0].name
     start, stop, count = (*atlas.ranges[name], entry) if _is_count(entry) else entry if _is_range(entry) else (0, 0, 0)
     if count < 2 and (_is_count(entry) or _is_range(entry)):
-        allowed = f"allowed is 2 or more; {float(count)} would fix {label}"
+        allowed = f"expected 2 or more; {float(count)} would fix {label}"
         raise InputError(f"grid.{label} = {count}: is a number of values; {allowed}")
     try:
         values = np.linspace(float(start), float(stop), count) if count else np.asarray(entry)
@@ -211,7 +211,7 @@ def _values(atlas: StoredAtlas, name: str, entry: Any) -> np.ndarray:
     except (TypeError, ValueError):
         values = np.empty(0)
     if values.dtype.kind not in "iuf" or values.ndim > 1 or not values.size:
-        raise InputError(f"grid.{label} = {shown(entry)}: allowed is {_ALLOWED}")
+        raise InputError(f"grid.{label} = {shown(entry)}: expected {_ALLOWED}")
     atlas.check_within(name, values)
     return values.astype(float)
 
@@ -233,7 +233,7 @@ class _Cells:
     def atlas(self, values: Mapping[str, float]) -> StoredAtlas:
         """The atlas of the parameters that vary, with ``values`` for some of them."""
         if _stamp(self.path) != self._stamp:
-            raise InputError(f"file = {self.path!r}: has changed since it was opened; allowed is to open it again")
+            raise InputError(f"file = {self.path!r}: has changed since it was opened; open it again")
         return _sliced(self.path, self._stamp, tuple({**self.fixed, **values}.items()))
 
     def block(self, key: Key, name: str) -> np.ndarray:

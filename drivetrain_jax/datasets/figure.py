@@ -60,7 +60,7 @@ def plot(
     """
     sources = [*result, *others] if isinstance(result, (list, tuple)) else [result, *others]
     if not sources:
-        raise InputError("result = []: allowed is a result, or a list of one or more")
+        raise InputError("result = []: expected a result, or a list of one or more")
     asked = [] if units is None else listed(units)
     datasets = [_dataset(source) for source in sources]
     kinds = [dataset.attrs.get("analysis") for dataset in datasets]
@@ -74,7 +74,7 @@ def plot(
 
         return drawn([with_boundaries(_loaded(datasets[0]), sources[1])], asked)
     if "atlas" in kinds:
-        raise InputError("results: an atlas among several; allowed is an atlas alone, or a chart and its atlas")
+        raise InputError("results: an atlas among several; expected an atlas alone, or a chart and its atlas")
     try:
         return drawn([_loaded(dataset) for dataset in datasets], asked)
     except (KeyError, IndexError) as error:
@@ -86,7 +86,7 @@ def plot(
 def lacks(error: Exception, why: str) -> InputError:
     """The error for a part of a result that lacks what ``error`` names."""
     lost = (re.search(r"'[^']+'", str(error)) or ["a dimension"])[0]
-    return InputError(f"result: without {lost}, which {why}; allowed is a whole result")
+    return InputError(f"result: without {lost}, which {why}; expected a whole result")
 
 
 def table(path: Path, units: str | None, separator: str = "") -> str:
@@ -96,7 +96,7 @@ def table(path: Path, units: str | None, separator: str = "") -> str:
     """
     dataset = _loaded(_dataset(path))
     if dataset.attrs.get("analysis") != "parameters":
-        raise InputError(f"file = {str(path)!r}: has a figure; allowed is a name that ends in .png, .pdf, .svg")
+        raise InputError(f"file = {str(path)!r}: has a figure; expected a name that ends in .png, .pdf, .svg")
     from drivetrain_jax.view import charts
     from drivetrain_jax.view.sheet import shown_title
     from drivetrain_jax.view.style import caption
@@ -131,7 +131,7 @@ def _dataset(source: Any) -> xr.Dataset:
     if isinstance(source, (str, Path)):
         return _opened(Path(source))
     raise InputError(
-        f"result: got a {type(source).__name__}; allowed is a Dataset, the path of a result, or a list of them"
+        f"result: got a {type(source).__name__}; expected a Dataset, the path of a result, or a list of them"
     )
 
 
@@ -153,10 +153,10 @@ def _chart(source: Result, part: Mapping[str, Any] | None, cells: int | None) ->
     from drivetrain_jax.runs.atlas_chart import chart
 
     if part is not None and not isinstance(part, Mapping):
-        raise InputError(f"part = {shown(part)}: allowed are numbers or (low, high) by the name of a parameter")
+        raise InputError(f"part = {shown(part)}: expected numbers or (low, high) by the name of a parameter")
     for name, value in (part or {}).items():
         if isinstance(value, (list, tuple)) and len(value) != 2:
-            raise InputError(f"part.{name} = {shown(value)}: allowed is a number or (low, high)")
+            raise InputError(f"part.{name} = {shown(value)}: expected a number or (low, high)")
     shown_part = {name: tuple(value) if isinstance(value, list) else value for name, value in (part or {}).items()}
     return chart(source, shown_part, CELLS if cells is None else cells)
 
@@ -204,7 +204,7 @@ def _loaded(dataset: xr.Dataset) -> xr.Dataset:
         return dataset
     outcome = dataset["outcome"]
     if outcome.dtype.kind == "U":
-        raise InputError("result: has words for codes; allowed is the result itself, before .drivetrain.named()")
+        raise InputError("result: has words for codes; expected the result itself, before .drivetrain.named()")
     if outcome.size > _MOST_CELLS:
         some = "select some with .sel or .isel"
         raise InputError(

@@ -60,9 +60,7 @@ def pack(stored: StoredAtlas) -> dict[str, Any]:
     atlas, system = stability.atlas, scene.system
     form, shaft = stability.form, stored.shaft
     if form.reversal is not None:
-        raise InputError(
-            f"system = {system.name!r}: reverses time by matrices; allowed is a constant reversor, or none"
-        )
+        raise InputError(f"system = {system.name!r}: reverses time by matrices; expected a constant reversor, or none")
     arrays = to_arrays(atlas)
     boxes = [{"lower": g.lower.tolist(), "upper": g.upper.tolist(), "reason": g.reason} for g in atlas.gaps]
     return {

@@ -333,13 +333,13 @@ def export(store: Path, out: Path) -> int:
     after an I/O error.
     """
     if out.suffix.lower() == ".csv":
-        raise InputError(f"FILE.nc = {str(out)!r}: allowed is a name in .nc; a table is written by --csv {out}")
+        raise InputError(f"FILE.nc = {str(out)!r}: expected a name in .nc; a table is written by --csv {out}")
     if not zarr_store.is_store(store):
         raise InputError(f"store = {str(store)!r}: not a Zarr store; give one of `drivetrain run --store zarr`")
     if not zarr_store.is_sealed(store):
         raise _damaged(store, "its attributes are damaged, or it is not finished")
     if out.exists() or not out.parent.is_dir() or PartsFolder(out).holds_work():
-        raise InputError(f"out = {str(out)!r}: allowed is a new file in an existing folder, without unfinished work")
+        raise InputError(f"out = {str(out)!r}: expected a new file in an existing folder, without unfinished work")
     attrs, layout, shards = zarr_store.attributes(store), zarr_store.layout(store), zarr_store.shards_of(store)
     scene = restore_scene(attrs["scene"])
     kept = {name: value for name, value in attrs.items() if name not in (zarr_store.SEAL, "coordinates")}
@@ -361,4 +361,4 @@ def export(store: Path, out: Path) -> int:
 
 
 def _damaged(store: Path, what: str) -> InputError:
-    return InputError(f"store = {str(store)!r}: {what}; allowed is a sound store: run its scene again with --fresh")
+    return InputError(f"store = {str(store)!r}: {what}; expected a sound store: run its scene again with --fresh")

@@ -72,7 +72,7 @@ def roles_of(atlas: StoredAtlas, *roles: str) -> list[str]:
     system = atlas.scene.system
     for role in roles:
         if role not in system.roles:
-            raise InputError(f"file: {system.name} names no {role}; allowed is a system that does")
+            raise InputError(f"file: {system.name} names no {role}; expected a system that does")
     return [system.roles[role] for role in roles]
 
 
@@ -104,7 +104,7 @@ class AtlasQuery:
         for name, value in given.items():
             meant = shaft.parameter_of(name) if shaft else name
             if meant in free and not (meant in within and isinstance(value, tuple)):
-                allowed = "allowed is to leave it out" + (", or LOW:HIGH" if meant in within else "")
+                allowed = "leave it out" + (", or LOW:HIGH" if meant in within else "")
                 raise InputError(f"{name} = {as_given(value)}: is the answer; {allowed}")
         for name in (*ranges, *free):
             if name not in atlas.parameters:
@@ -114,9 +114,10 @@ class AtlasQuery:
         for name, value in values.items():
             if name in atlas.fixed and name not in free:
                 source = shaft.physical.source(name) if shaft and name not in given else ""
-                made = shaft.quantity(name, atlas.fixed[name]) if shaft and source else None
-                if made and made[0] in given and not isinstance(value, tuple) and (typed := shaft.quantity(name, value)):
-                    check_same(made[0], typed[1], made[1], units=made[2])
+                if shaft and source and isinstance(value, float):
+                    known, made = (shaft.quantity(name, x) for x in (value, atlas.fixed[name]))
+                    if known and made and made[0] in given:
+                        check_same(made[0], known[1], made[1], units=made[2])
                 check_same(name, value, atlas.fixed[name], source)
         kept = {name for name in atlas.parameters if name not in free or name in within}
         kept_values = {name: atlas.ranges[name] for name in ranges}
@@ -222,7 +223,7 @@ def _check_range(atlas: StoredAtlas, name: str, value: Any, wanted: bool) -> Non
     low, high = atlas.ranges[name]
     label: str = atlas.viewed_as(name)[0].name
     ends = value if isinstance(value, tuple) else (value,)
-    allowed = f"allowed is {f'{label}=LOW:HIGH within ' if wanted else ''}{atlas.allowed(name)}"
+    allowed = f"expected {f'{label}=LOW:HIGH within ' if wanted else ''}{atlas.allowed(name)}"
     if value is None:
         raise InputError(f"{label}: missing; {allowed}")
     numbers = [atlas.viewed_as(name, end)[-1] if isinstance(end, float) else end for end in ends]
@@ -234,7 +235,7 @@ def _check_range(atlas: StoredAtlas, name: str, value: Any, wanted: bool) -> Non
         if isinstance(end, bool) or not isinstance(end, (int, float)) or not low <= end <= high:
             raise InputError(f"{label} = {as_given(number)}: {allowed}")
     if wanted and not value[0] < value[1]:
-        raise InputError(f"{label} = {shown}: allowed is a rising range")
+        raise InputError(f"{label} = {shown}: expected a rising range")
 
 
 def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None) -> Reply:
@@ -361,7 +362,7 @@ def _limit(
     shown = {quantity.name: name for name, (quantity, _) in atlas.viewed(given, (vary,)).views.items()}
     limited = shown.get(vary, vary) or roles_of(atlas, role)[0]
     if limited == speed:
-        raise InputError(f"vary = {vary!r}: is the speed; allowed is another parameter of the atlas")
+        raise InputError(f"vary = {vary!r}: is the speed; expected another parameter of the atlas")
     asked = replace(AtlasQuery.of(atlas, given, ranges=(speed,), free=(limited,)), show=show)
     panels, system = atlas.stability.atlas, atlas.scene.system
     return asked, question(panels, system, asked.values[speed], asked.numbers(), vary=limited, direct=asked.direct)
@@ -374,7 +375,7 @@ def speed_windows(
     given. Raises as :func:`query`."""
     if not 0 <= margin < 1:
         meant = f"; did you mean {margin:g} %?" if 1 <= margin < 100 else ""
-        raise InputError(f"margin = {margin!r}: allowed is 0 <= margin < 1{meant}")
+        raise InputError(f"margin = {margin!r}: expected 0 <= margin < 1{meant}")
     (speed,) = roles_of(atlas, "speed")
     asked = replace(AtlasQuery.of(atlas, given, ranges=(), free=(speed,), within=(speed,)), show=show)
     panels = atlas.stability.atlas

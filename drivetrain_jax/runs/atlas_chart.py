@@ -46,7 +46,7 @@ def chart(source: str | Path | xr.Dataset, part: Mapping[str, float | tuple[floa
     Raises :class:`InputError` for values outside the atlas, :class:`ChunkError` if a direct solve in a gap fails.
     """
     if not isinstance(cells, (int, np.integer)) or isinstance(cells, bool) or not 2 <= cells <= 20_000:
-        raise InputError(f"cells = {quoted(cells)}: allowed is a whole number, 2 <= cells <= 20000")
+        raise InputError(f"cells = {quoted(cells)}: expected a whole number, 2 <= cells <= 20000")
     atlas = open_atlas(source).viewed(part)
     ranges = _ranges(atlas, atlas.in_parameters(part))
     fixed = {name: value for name, value in ranges.items() if not isinstance(value, tuple)}
@@ -81,7 +81,7 @@ def with_boundaries(dataset: xr.Dataset, source: str | Path | xr.Dataset) -> xr.
     atlas = open_atlas(source)
     system = atlas.scene.system
     if (name := dataset.attrs.get("system")) != system.name:
-        raise InputError(f"system = {name!r}: the atlas is one of {system.name}; allowed is a chart of {system.name}")
+        raise InputError(f"system = {name!r}: the atlas is one of {system.name}; expected a chart of {system.name}")
     entries = json.loads(dataset.attrs.get("fixed_parameters", "{}"))
     known = {name: np.asarray(entry["value"]) for name, entry in entries.items()}
     swept = {str(axis.attrs.get("parameter", name)): axis for name, axis in dataset.coords.items()}
@@ -91,7 +91,7 @@ def with_boundaries(dataset: xr.Dataset, source: str | Path | xr.Dataset) -> xr.
     plane, fixed = {}, {}
     for name in _shown(system, list(atlas.parameters)):
         if name not in known:
-            raise InputError(f"{name}: missing in the chart; allowed is {atlas.allowed(name)}")
+            raise InputError(f"{name}: missing in the chart; expected {atlas.allowed(name)}")
         atlas.check_within(name, np.ravel(known[name]))
         low, high = float(known[name].min()), float(known[name].max())
         plane |= {name: (low, high)} if low < high else {}
@@ -142,7 +142,7 @@ def _ranges(atlas: StoredAtlas, part: Mapping[str, Any]) -> dict[str, Any]:
         if not rising or not all(low <= end <= high for end in np.atleast_1d(value)):
             shown, *ends = atlas.viewed_as(name, *np.atleast_1d(value))
             text = as_given(tuple(ends))
-            raise InputError(f"{shown.name} = {text}: allowed is a number or LOW:HIGH, {atlas.allowed(name)}")
+            raise InputError(f"{shown.name} = {text}: expected a number or LOW:HIGH, {atlas.allowed(name)}")
     return {name: part.get(name, atlas.ranges[name]) for name in atlas.parameters}
 
 

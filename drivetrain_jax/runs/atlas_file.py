@@ -77,7 +77,7 @@ def broadcast(values: Mapping[str, Any]) -> tuple[xr.DataArray, ...]:
     except ValueError:
         shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in values.items())
         allowed = "arrays that broadcast against each other, of the same labels along a dimension that they share"
-        raise InputError(f"shapes {shapes}: allowed are {allowed}") from None
+        raise InputError(f"shapes {shapes}: expected {allowed}") from None
 
 
 # Values along each axis of the stored chart.
@@ -163,13 +163,13 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
     label = f"file = {str(source)!r}" if isinstance(source, (str, Path)) else "dataset"
     arrays, attrs = _content(source, label)
     if missing := _missing(arrays, attrs):
-        raise InputError(f"{label}: lacks {missing[0]}; allowed is the whole result of a scene of an atlas")
+        raise InputError(f"{label}: lacks {missing[0]}; expected the whole result of a scene of an atlas")
     scene = restore_scene(attrs["scene"])
     names, ends = tuple(map(str, arrays["parameter"])), zip(arrays["lower"], arrays["upper"], strict=True)
     ranges = dict(zip(names, ends, strict=True))
     domain = floquet_domain(scene.system, ranges, scene.fixed)
     if [c.name for c in domain.coordinates] != json.loads(attrs["coordinates_of_panels"]):
-        raise InputError(f"{label}: made by another version of {scene.system.name}; allowed is to run its scene again")
+        raise InputError(f"{label}: made by another version of {scene.system.name}; run its scene again")
     blank = {name: np.empty((0, len(names))) for name in ("panel_lower", "panel_upper", "gap_lower", "gap_upper")}
     blank |= {"panel_degrees": np.empty((0, len(names)), int), "gap_reason": np.empty(0), "kept": np.empty(0, np.uint8)}
     arrays = blank | {"coefficients": np.empty((0, 0))} | arrays
@@ -190,9 +190,9 @@ def _content(source: str | Path | xr.Dataset, label: str) -> tuple[dict[str, np.
         attrs = dataset.attrs
         arrays = {n: dataset[n].values for n in (*_VARIABLES, "parameter", "gap_reason") if n in dataset}
     if attrs.get("analysis") != ANALYSIS.name:
-        raise InputError(f"{label}: holds the analysis {attrs.get('analysis')!r}; allowed is an atlas")
+        raise InputError(f"{label}: holds the analysis {attrs.get('analysis')!r}; expected an atlas")
     if changed:
-        raise InputError(f"{label}: damaged ({checksums.named(changed)}); allowed is to restore it or to run it again")
+        raise InputError(f"{label}: damaged ({checksums.named(changed)}); restore it or run it again")
     return arrays, attrs
 
 
@@ -288,16 +288,16 @@ class StoredAtlas:
         outside = numbers[~((numbers >= low) & (numbers <= high))]
         if outside.size:
             shown, value = self.viewed_as(name, outside.flat[0])
-            raise InputError(f"{shown.name} = {value:.10g}: allowed is {self.allowed(name)}")
+            raise InputError(f"{shown.name} = {value:.10g}: expected {self.allowed(name)}")
 
     def refuse(self, name: str, value: Any, *others: str) -> NoReturn:
         """Raise :class:`InputError` for a name that is neither a parameter nor one of ``others``."""
         if name in self.fixed:
             made = f"the atlas is made for {name} = {as_given(self.fixed[name])}"
-            raise InputError(f"{name} = {as_given(value)}: {made}; allowed is to leave it out")
+            raise InputError(f"{name} = {as_given(value)}: {made}; leave it out")
         guess = did_you_mean(name, (*self.parameters, *(shown.name for shown, _ in self.views.values()), *others))
         allowed = "; ".join(map(self.allowed, self.parameters))
-        raise InputError(f"{name} = {as_given(value)}: not a parameter of the atlas{guess}; allowed is {allowed}")
+        raise InputError(f"{name} = {as_given(value)}: not a parameter of the atlas{guess}; expected {allowed}")
 
     def __repr__(self) -> str:
         ends = [self.viewed_as(name, *ends) for name, ends in self.ranges.items()]
@@ -352,7 +352,7 @@ class StoredAtlas:
         for name, column in axes.items():
             if column.ndim > 1 or not column.size:
                 shown = self.viewed_as(name)[0].name
-                raise InputError(f"{shown}: an array of shape {column.shape}; allowed is a number or a row of numbers")
+                raise InputError(f"{shown}: an array of shape {column.shape}; expected a number or a row of numbers")
         if not axes:
             return self(proved=proved, **given)
         fixed = {name: float(column) for name, column in columns.items() if not column.ndim}
@@ -465,7 +465,7 @@ class StoredAtlas:
                 self.refuse(name, values[name])
         for name in self.parameters:
             if name not in values:
-                raise InputError(f"{self.viewed_as(name)[0].name}: missing; allowed is {self.allowed(name)}")
+                raise InputError(f"{self.viewed_as(name)[0].name}: missing; expected {self.allowed(name)}")
         return self.parameters
 
     def _checked(self, name: str, values: Mapping[str, Any]) -> Any:
@@ -475,7 +475,7 @@ class StoredAtlas:
             # Numbers that jax traces, or rows of different lengths.
             numbers = np.empty(0, object)
         if numbers.dtype.kind not in "iuf":
-            raise InputError(f"{name} = {shown(values[name])}: allowed are numbers")
+            raise InputError(f"{name} = {shown(values[name])}: expected numbers")
         self.check_within(name, numbers)
         return values[name]
 
@@ -509,12 +509,12 @@ def verify_proof(path: Path) -> tuple[str, str]:
     atlas, system = stored.stability.atlas, stored.scene.system
     proved = [panel for panel in atlas.panels if np.isfinite(panel.proved_error)]
     if not proved:
-        reason = proof.with_proofs(atlas, system)[1] or "allowed is to run its scene again"
+        reason = proof.with_proofs(atlas, system)[1] or "run its scene again"
         return "proof: none in this file", f"holds no proof; {reason}"
     errors = [(proof.proved_error(atlas, panel, system), panel.proved_error) for panel in proved]
     computed, claimed = max(errors, key=lambda pair: pair[0] / pair[1])
     lines = f"proof: errors of {len(proved)} of {len(atlas.panels)} panels at most {computed:.2e}, stored {claimed:.2e}"
-    wrong = f"proved_error = {claimed:.2e}: the proof gives {computed:.2e}; allowed is to compute the file again"
+    wrong = f"proved_error = {claimed:.2e}: the proof gives {computed:.2e}; compute the file again"
     columns = [np.linspace(*ends, _CELLS) for ends in stored.ranges.values()]
     points = np.stack([x.reshape(-1) for x in np.meshgrid(*columns, indexing="ij")], axis=-1)
     codes, stated = proof.verdicts(atlas, system, points), stored.stability.at(points)["verdict"]
@@ -522,9 +522,7 @@ def verify_proof(path: Path) -> tuple[str, str]:
     agree = int((both & (codes == stated)).sum())
     line = f"{lines}; {agree} of {codes.size} verdicts of a chart proved"
     other = int(both.sum()) - agree
-    problem = (
-        wrong if computed > claimed else f"{other} verdicts contradict the proof; allowed is none" if other else ""
-    )
+    problem = wrong if computed > claimed else f"{other} verdicts contradict the proof; expected none" if other else ""
     return line, problem
 
 

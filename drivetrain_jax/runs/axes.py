@@ -127,31 +127,31 @@ def check_count(name: str, table: AxisTable, continuous: bool) -> int:
     keys = [key for key in table.__struct_fields__ if getattr(table, key) is not None]
     if continuous and (extra := [key for key in keys if key not in ("start", "stop")]):
         value = getattr(table, extra[0])
-        raise InputError(f"{field}.{extra[0]} = {value!r}: an atlas has ranges; allowed is start and stop")
+        raise InputError(f"{field}.{extra[0]} = {value!r}: an atlas has ranges; expected start and stop")
     if table.values is not None:
         if keys != ["values"]:
-            allowed = f"allowed is one of the two ({field} = [...] replaces the whole axis)"
+            allowed = f"expected one of the two ({field} = [...] replaces the whole axis)"
             raise InputError(f"{field}: values given together with {', '.join(keys[:-1])}; {allowed}")
         if not table.values:
-            raise InputError(f"{field}.values = []: empty axis; allowed is one value or more")
+            raise InputError(f"{field}.values = []: empty axis; expected one value or more")
         return len(table.values)
     if missing := [key for key in ("start", "stop") if key not in keys]:
         allowed = "start and stop" if continuous else "start, stop and num, or values"
-        raise InputError(f"{field}.{missing[0]}: missing; allowed is {allowed}")
+        raise InputError(f"{field}.{missing[0]}: missing; expected {allowed}")
     start, stop, num = cast(float, table.start), cast(float, table.stop), table.num
     if continuous:
         if not start < stop:
-            raise InputError(f"{field}.stop = {stop!r}: allowed is stop > start = {start!r}")
+            raise InputError(f"{field}.stop = {stop!r}: expected stop > start = {start!r}")
         return 2
     if num is None:
-        raise InputError(f"{field}.num: missing; allowed is num >= 1 (a range without num: analysis = 'atlas')")
+        raise InputError(f"{field}.num: missing; expected num >= 1 (a range without num: analysis = 'atlas')")
     if num < 1:
-        raise InputError(f"{field}.num = {num}: empty axis; allowed is num >= 1")
+        raise InputError(f"{field}.num = {num}: empty axis; expected num >= 1")
     if num == 1 and start != stop:
         ends = f"start = {start!r} and stop = {stop!r}"
-        raise InputError(f"{field}.num = 1: {ends} are two values; allowed is num >= 2, or values = [{start!r}]")
+        raise InputError(f"{field}.num = 1: {ends} are two values; expected num >= 2, or values = [{start!r}]")
     if table.scale not in (None, *_SCALES):
-        raise InputError(f"{field}.scale = {table.scale!r}: allowed is one of {', '.join(_SCALES)}")
+        raise InputError(f"{field}.scale = {table.scale!r}: expected one of {', '.join(_SCALES)}")
     if table.scale == "log" and not (start > 0 and stop > 0):
         key, value = ("stop", stop) if start > 0 else ("start", start)
         raise InputError(f"{field}.{key} = {value}: allowed on a log axis is {key} > 0")
@@ -169,7 +169,7 @@ def spread(table: AxisTable, field: str) -> np.ndarray:
     ordered = np.sort(values)
     double = np.flatnonzero(ordered[1:] == ordered[:-1])
     if double.size:
-        raise InputError(f"{field}: the value {ordered[double[0]]:.10g} occurs twice; allowed are distinct values")
+        raise InputError(f"{field}: the value {ordered[double[0]]:.10g} occurs twice; expected distinct values")
     return values
 
 

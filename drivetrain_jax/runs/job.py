@@ -69,7 +69,7 @@ class Job:
             use_double_precision()
             if not config.jax_enable_x64:
                 state = "jax_enable_x64 = False: set by the context of this call"
-                raise InputError(f"{state}; allowed is jax.enable_x64(True)")
+                raise InputError(f"{state}; expected jax.enable_x64(True)")
         _programs.enable(short=True)
         return tuple(map(for_device, self.problem.solvers))
 

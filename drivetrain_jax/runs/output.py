@@ -70,10 +70,10 @@ class Output:
         self.store = store or (ZARR if is_store else self.unfinished.get("store", HDF5))
         self._files: Any = zarr_store if self.store == ZARR else consolidate
         if self.out.is_dir() and not (is_store and self.store == ZARR):
-            raise self.error("is a folder; allowed is the path of a file")
+            raise self.error("is a folder; expected the path of a file")
         if self.out.exists() and not self.out.is_dir() and not (self.out.is_file() and self.store == HDF5):
             what = "is a file; allowed for store = 'zarr' is a new path, or such a store"
-            raise self.error(what if self.store == ZARR else "not a regular file; allowed is the path of a file")
+            raise self.error(what if self.store == ZARR else "not a regular file; expected the path of a file")
         self.present = self._digest()
 
     def error(self, text: str) -> InputError:
@@ -84,19 +84,19 @@ class Output:
         folder, parts, ending = self.out.parent, self.parts.path, self.out.suffix.lower()
         guess = did_you_mean(ending, (".zarr",)) if ending != ".zarr" else ""
         if guess or ending in _FOREIGN:
-            raise self.error(f"a result is netCDF or Zarr; allowed is a name that ends in .nc or .zarr{guess}")
+            raise self.error(f"a result is netCDF or Zarr; expected a name that ends in .nc or .zarr{guess}")
         try:
             if not folder.is_dir():
-                raise self.error(f"the folder {str(folder)!r} does not exist; allowed is a file in an existing folder")
+                raise self.error(f"the folder {str(folder)!r} does not exist; expected a file in an existing folder")
             if parts.exists() and not (parts.is_dir() and os.access(parts, os.R_OK | os.X_OK)):
-                raise self.error(f"{str(parts)!r} is no readable folder; allowed is to move it away")
+                raise self.error(f"{str(parts)!r} is no readable folder; move it away")
         except OSError as error:
-            raise self.error(f"{error.strerror} (with '.parts'); allowed is a shorter name") from None
+            raise self.error(f"{error.strerror} (with '.parts'); expected a shorter name") from None
 
     def _digest(self) -> str | None:
         if not self.out.exists():
             return None
-        allowed = "allowed is a new file or a result of drivetrain_jax"
+        allowed = "expected a new file or a result of drivetrain_jax"
         try:
             digest = self._files.attributes(self.out).get("digest")
         except InputError:
@@ -204,7 +204,7 @@ class Output:
         Raises :class:`InputError` if unfinished work uses other results, or if one of ``reuse`` has no common points.
         """
         if reuse and self.store == ZARR:
-            raise InputError("reuse: given together with store = 'zarr'; allowed is one of them")
+            raise InputError("reuse: given together with store = 'zarr'; expected one of them")
         if reuse and not self.job.route.is_pointwise:
             raise InputError("reuse: not available for an atlas; allowed for a scene with direct solves")
         if not self.job.route.is_pointwise:
@@ -221,7 +221,7 @@ class Output:
             files = ", ".join(self.unfinished.get("reused_files") or ["no other result"])
             raise InputError(
                 f"reuse = {[str(p) for p in paths]}: the unfinished work at {str(self.out)!r} takes points from {files}; "
-                "allowed is the same again, or --fresh"
+                "expected the same again, or --fresh"
             )
         return reused
 
@@ -357,11 +357,9 @@ def open_result(path: str | Path) -> xr.Dataset:
     job = resolve(restore_scene(str(PartsFolder(path).plan().get("scene", ""))))
     output = Output(path, job)
     if output.state != "partial":
-        raise InputError(f"file = {str(path)!r}: holds {output.obstacle}; allowed is to run its scene again")
+        raise InputError(f"file = {str(path)!r}: holds {output.obstacle}; run its scene again")
     if not job.route.is_pointwise:
-        raise InputError(
-            f"file = {str(path)!r}: an atlas that is not finished; allowed is to wait for it or to resume it"
-        )
+        raise InputError(f"file = {str(path)!r}: an atlas that is not finished; wait for it or resume it")
     buffer, count = ResultBuffer(job.scene, job.grid), 0
     for points, results in output.finished():
         buffer.fill(points, results)

@@ -75,10 +75,10 @@ def sweep(
     (('beta', 'Omega'), (3, 2))
     """
     if not callable(function):
-        raise InputError(f"function = {shown(function)}: allowed is a function, such as drivetrain_jax.floquet")
+        raise InputError(f"function = {shown(function)}: expected a function, such as drivetrain_jax.floquet")
     if not isinstance(over, Mapping) or not over:
         value = f" = {shown(over)}" if over else ": empty"
-        raise InputError(f"over{value}; allowed are values by the name of a parameter")
+        raise InputError(f"over{value}; expected values by the name of a parameter")
     _check_concrete(system, over, options)
     of_another_package = isinstance(function, analyses.AnalysisFunction)
     name = function.name if of_another_package else getattr(function, "__name__", "")
@@ -117,7 +117,7 @@ def _plain(name: str, value: Any, listed: bool) -> Any:
     if isinstance(value, tuple) or (listed and np.ndim(value) == 1):
         return [_plain(f"{name}[{i}]", entry, False) for i, entry in enumerate(value)]
     if np.ndim(value):
-        raise InputError(f"{name}: an array of the shape {np.shape(value)}; allowed is a number, or {name} in over")
+        raise InputError(f"{name}: an array of the shape {np.shape(value)}; expected a number, or {name} in over")
     return float(value)
 
 
@@ -135,10 +135,10 @@ def _numbers(name: str, values: Any) -> list[float]:
             raise TypeError(row.dtype)
         array = row.astype(float)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"over.{name}: got {shown(values)}; allowed are numbers") from None
+        raise InputError(f"over.{name}: got {shown(values)}; expected numbers") from None
     if array.ndim != 1 or not array.size:
         raise InputError(
-            f"over.{name}: got an array of the shape {array.shape}; allowed is one of the shape (N,), N >= 1"
+            f"over.{name}: got an array of the shape {array.shape}; expected one of the shape (N,), N >= 1"
         )
     return array.tolist()
 
@@ -157,11 +157,11 @@ def _function_scene(
     ``results`` with ``dims`` are those of a function that is an analysis, which takes ``outputs`` as an argument.
     """
     if jax.tree_util.treedef_is_leaf(jax.tree.structure(system)):
-        raise InputError(f"system: got a {type(system).__name__}; allowed is a pytree, such as a dict of numbers")
+        raise InputError(f"system: got a {type(system).__name__}; expected a pytree, such as a dict of numbers")
     known = {p.name: p for p in system.parameters} if isinstance(system, System) else {}
     values = {}
     if OUTCOME.name in over:
-        raise InputError(f"over.{OUTCOME.name}: the name of a result; allowed is another name")
+        raise InputError(f"over.{OUTCOME.name}: the name of a result; expected another name")
     for name, entries in over.items():
         described = known.get(entry_of(name)[0], Parameter(name, "1", name))
         scalar = replace(described, name=name, listed=False, broadcast=False)
@@ -186,7 +186,7 @@ def _function_scene(
     axes = tuple(Axis(key, kind.parameter(key), None, numbers) for key, numbers in values.items())
     names = [*(axis.dim for axis in axes), *wanted, *dict.fromkeys(dim for v in variables for dim in v.dims)]
     if double := [label for label in names if names.count(label) > 1]:
-        raise InputError(f"over: {double[0]!r} names two dimensions or results; allowed are distinct names")
+        raise InputError(f"over: {double[0]!r} names two dimensions or results; expected distinct names")
     text = f'system = "{kind.name}"\nanalysis = "{name}"\n\n[fixed]\n{_COMPUTES} = "{computes}"\n'
     request, fixed = Request(tuple(wanted), "function", {}), {_COMPUTES: computes}
     return Scene(kind, analysis, request, axes, False, fixed, f"{name} of {kind.title}", text)
@@ -284,12 +284,12 @@ def _named(result: Any, name: str) -> dict[str, Array]:
             arrays[str(key)] = jnp.asarray(value)
         except (TypeError, ValueError):
             what = f"a {type(value).__name__}" + (f" as {key!r}" if named is result else "")
-            raise InputError(f"function: returns {what}; allowed is an array or a flat dict of arrays") from None
+            raise InputError(f"function: returns {what}; expected an array or a flat dict of arrays") from None
         if not _STORED_NAME.fullmatch(str(key)) or key in _RESERVED:
-            raise InputError(f"function: returns a result {key!r}; allowed is another name, without /")
+            raise InputError(f"function: returns a result {key!r}; expected another name, without /")
         array = arrays[str(key)]
         if key == OUTCOME.name and (array.ndim or not jnp.issubdtype(array.dtype, jnp.integer)):
-            allowed = f"allowed is one integer, a code of the outcome from 0 to {max(Outcome)}, or another name"
+            allowed = f"expected one integer, a code of the outcome from 0 to {max(Outcome)}, or another name"
             raise InputError(f"outcome: the function returns {array.dtype} of the shape {array.shape}; {allowed}")
     return arrays
 
@@ -302,7 +302,7 @@ def _wanted(outputs: Sequence[str] | None, known: Sequence[str], name: str) -> l
         if key not in known:
             raise InputError(f"outputs: {key!r} is not a result of {name}{nearest(str(key), known)}")
     if known and not wanted:
-        raise InputError(f"outputs = {shown(outputs)}: allowed is one or more of {', '.join(known)}")
+        raise InputError(f"outputs = {shown(outputs)}: expected one or more of {', '.join(known)}")
     return wanted
 
 
@@ -310,7 +310,7 @@ def _check_concrete(*values: Any) -> None:
     """Check that there are numbers for a file and a dataset."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values)):
         raise InputError(
-            "sweep: does not work under jax.jit, jax.grad or jax.vmap; allowed are numbers outside of them, "
+            "sweep: does not work under jax.jit, jax.grad or jax.vmap; expected numbers outside of them, "
             "or jax.vmap(function) in place of the sweep"
         )
 
@@ -346,7 +346,7 @@ def _number(system: Any, old: Any, name: str, value: Array) -> Array:
     if not (declared or old is None or (jax.tree_util.all_leaves([old]) and not listed and not isinstance(old, str))):
         kind = "an array" if hasattr(old, "ndim") else f"a {type(old).__name__}"
         allowed = f'one entry, for example "{name}[0]"' if listed else "a number"
-        raise InputError(f"over.{name}: {kind} cannot vary as a whole; allowed is {allowed}")
+        raise InputError(f"over.{name}: {kind} cannot vary as a whole; expected {allowed}")
     return value
 
 
@@ -354,9 +354,9 @@ def _with_entry(old: Any, entry: int, value: Array, name: str) -> Any:
     """``old``, an array, list or tuple, with one number replaced."""
     base = entry_of(name)[0]
     if not (isinstance(old, (list, tuple)) or getattr(old, "ndim", 0) > 0):
-        raise InputError(f"over.{name}: {base} is not a list; allowed is {base}")
+        raise InputError(f"over.{name}: {base} is not a list; expected {base}")
     if entry >= len(old):
-        allowed = f"allowed is {base}[0] to {base}[{len(old) - 1}]" if len(old) else f"{base} is empty"
+        allowed = f"expected {base}[0] to {base}[{len(old) - 1}]" if len(old) else f"{base} is empty"
         raise InputError(f"over.{name}: {allowed}")
     if isinstance(old, (list, tuple)):
         return eqx.tree_at(lambda entries: entries[entry], old, value, is_leaf=lambda x: x is None)

@@ -167,7 +167,7 @@ def _numbers(parameter: Parameter, value: Any, physical: bool) -> Any:
     try:
         numbers = np.asarray(value, float)
     except (TypeError, ValueError):
-        raise InputError(f"{parameter.name} = {shown(value)}: allowed are numbers, {parameter.allowed}") from None
+        raise InputError(f"{parameter.name} = {shown(value)}: expected numbers, {parameter.allowed}") from None
     for extreme in (numbers.min(), numbers.max()) if numbers.size else ():
         checked(parameter, float(extreme), "")
     return value if hasattr(value, "ndim") else numbers
@@ -187,7 +187,7 @@ def read_table(path: Path) -> dict[str, Any]:
     """
     rows = _rows(path).dropna(how="all")
     if len(rows) < 2:
-        raise InputError(f"data = {str(path)!r}: no values; allowed is a row of names and rows of values")
+        raise InputError(f"data = {str(path)!r}: no values; expected a row of names and rows of values")
     columns: dict[str, Any] = {}
     for header, *cells in (rows[number].tolist() for number in rows):
         if isinstance(header, str):
@@ -195,11 +195,11 @@ def read_table(path: Path) -> dict[str, Any]:
             if name == _NAMES:
                 continue
             if name in columns:
-                raise InputError(f"data = {str(path)!r}: has two columns {name}; allowed is one")
+                raise InputError(f"data = {str(path)!r}: has two columns {name}; expected one")
             count = max((i + 1 for i, cell in enumerate(cells) if isinstance(cell, str)), default=0)
             if not count or not all(isinstance(cell, str) for cell in cells[:count]):
                 where = "has an empty cell between values" if count else "is empty"
-                allowed = "allowed is a value in every row, or in the first"
+                allowed = "expected a value in every row, or in the first"
                 raise InputError(f"data = {str(path)!r}: column {name} {where}; {allowed}")
             values = [_value(path, name, cell.strip(), unit) for cell in cells[:count]]
             columns[name] = values if count > 1 else values[0]
@@ -213,7 +213,7 @@ def _value(path: Path, name: str, text: str, unit: str | None) -> Any:
         value = float(text)
     except ValueError:
         if measured:
-            allowed = f"allowed is a number in {unit}, with a decimal point"
+            allowed = f"expected a number in {unit}, with a decimal point"
             raise InputError(f"data = {str(path)!r}: {name} = {clipped(text)!r}: {allowed}") from None
         return text
     return f"{value!r} {unit}" if measured else value
@@ -235,9 +235,9 @@ def _rows(path: Path) -> pd.DataFrame:
     except ImportError:
         raise InputError("data: .xlsx needs the package openpyxl; pip install 'drivetrain_jax[tables]'") from None
     except OSError as error:
-        raise InputError(f"data = {str(path)!r}: {error.strerror or error}; allowed is a table") from None
+        raise InputError(f"data = {str(path)!r}: {error.strerror or error}; expected a table") from None
     # Readers raise exceptions of zip files, XML and their own for a damaged file.
     except Exception as error:
         allowed = "CSV in UTF-8 with a value a column, numbers with a decimal point" if kind == ".csv" else "a workbook"
-        raise InputError(f"data = {str(path)!r}: {clipped(str(error))}; allowed is {allowed}") from None
-    raise InputError(f"data = {str(path)!r}: allowed is a file that ends in .csv or .xlsx")
+        raise InputError(f"data = {str(path)!r}: {clipped(str(error))}; expected {allowed}") from None
+    raise InputError(f"data = {str(path)!r}: expected a file that ends in .csv or .xlsx")

@@ -282,7 +282,7 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
     for name, value in given.items():
         if name not in names:
             guess = did_you_mean(name, (*names, "outputs", "amplitude")) or meant(name, parameters.values())
-            raise InputError(f"{name} = {shown(value)}: unknown{guess}; allowed is {', '.join(names)}")
+            raise InputError(f"{name} = {shown(value)}: unknown{guess}; expected {', '.join(names)}")
         if name not in parameters:
             tree["options"][name] = value
         elif name in numbers and not isinstance(value, (list, tuple)):

@@ -55,16 +55,16 @@ def choose_atlas(scene: Scene) -> tuple[Ranges, int | None] | None:
         if scene.request.method == "atlas":
             names = ", ".join(part.name for part in several.together)
             raise InputError(
-                f"options.method = 'atlas': axes.{several.shown.name} changes {names} together; allowed are auto and direct"
+                f"options.method = 'atlas': axes.{several.shown.name} changes {names} together; expected auto and direct"
             )
         return None
     if whole := next((name for name in ranges if scene.system.parameter(entry_of(name)[0]).integer), ""):
         if scene.request.method == "atlas":
-            raise InputError(f"options.method = 'atlas': {whole} is an integer; allowed are auto and direct")
+            raise InputError(f"options.method = 'atlas': {whole} is an integer; expected auto and direct")
         return None
     if scene.request.method == "atlas":
         if len(ranges) > MAX_RANGES:
-            allowed = f"allowed are at most {MAX_RANGES}"
+            allowed = f"expected at most {MAX_RANGES}"
             raise InputError(f"options.method = 'atlas': the scene varies {len(ranges)} parameters; {allowed}")
         return (ranges, None) if ranges else None
     model, grid = scene.system.models.get(ANALYSIS.name), Grid.of(scene)

@@ -36,7 +36,7 @@ class NotReusable(InputError):
     """Raised if no point of a result can be reused; ``damage`` names the damaged variables of the result, if any."""
 
     def __init__(self, path: Path, why: str, allowed: str, damage: str = "") -> None:
-        super().__init__(f"reuse = {str(path)!r}: {why}; allowed is {allowed}")
+        super().__init__(f"reuse = {str(path)!r}: {why}; expected {allowed}")
         self.damage = damage
 
 
@@ -136,7 +136,7 @@ def find(job: Job, path: Path) -> ReusableResult:
     # The checksums of the new result would hide damage.
     wrong = checksums.named(checksums.damaged(path) or misfits(consolidate.layout(path), scene))
     if damage := wrong or ("" if "checksums" in attrs else "it has no checksums"):
-        raise NotReusable(path, f"damaged ({damage})", "to restore the file or to compute it again", damage)
+        raise NotReusable(path, f"damaged ({damage})", "to restore the file or compute it again", damage)
     grid = Grid.of(scene)
     theirs, ours = _same_points(scene, grid, job)
     if theirs.size:

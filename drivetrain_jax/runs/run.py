@@ -80,7 +80,7 @@ def run(
     """
     executor = make_executor(threads, workers, dask)
     if out is None and reuse:
-        raise InputError("reuse: given without out; allowed is a run into a file")
+        raise InputError("reuse: given without out; expected a run into a file")
     with shown_progress(report) as show:
         if out is None:
             return _in_memory(_job(scene, overrides, on_disk=False), executor, show)
@@ -107,7 +107,7 @@ def run_to_file(
     job = _job(scene, overrides, on_disk=True)
     output = Output(out, job, _store(out, store))
     if output.store == ZARR and not job.route.is_pointwise:
-        raise InputError("store = 'zarr': not available for an atlas; allowed is hdf5, or a scene with direct solves")
+        raise InputError("store = 'zarr': not available for an atlas; expected hdf5, or a scene with direct solves")
     if not fresh and output.state == "complete":
         output.discard()
         total, outcomes = output.counted()
@@ -126,7 +126,7 @@ def _store(out: Path, asked: str | None) -> str:
     """The store for ``out``; :class:`InputError` for an HDF5 file with the name of a Zarr store."""
     named = out.suffix.lower() == ".zarr"
     if named and asked == HDF5:
-        allowed = f"allowed is a name such as {out.stem}.nc, or `drivetrain run --store zarr`"
+        allowed = f"expected a name such as {out.stem}.nc, or `drivetrain run --store zarr`"
         raise InputError(f"out = {str(out)!r}: names a Zarr store; {allowed}")
     return asked or (ZARR if named else HDF5)
 

@@ -216,7 +216,7 @@ def _given(table: _SceneTable, system: type[System], axes: tuple[Axis, ...]) -> 
             raise InputError(f"fixed.{name} = {shown(value)}: {unknown_parameter(system, name)}")
         if name in whole:
             where = "points" if table.points else "axes"
-            raise InputError(f"fixed.{name} = {shown(value)}: also in [{where}]; allowed is one of the two")
+            raise InputError(f"fixed.{name} = {shown(value)}: also in [{where}]; expected one of the two")
     names = [name for name in known if name in table.fixed]
     return {name: checked(known[name], table.fixed[name], "fixed.") for name in names}
 
@@ -238,7 +238,7 @@ def _fixed(
         others = f" (missing too: {', '.join(p.name for p in missing[1:])})" if missing[1:] else ""
         data = system.physical.source(missing[0].name) if system.physical else ""
         either = f", or physical data: {data}" if data else ""
-        raise InputError(f"fixed.{missing[0].name}: missing; allowed is {missing[0].allowed_in_units}{others}{either}")
+        raise InputError(f"fixed.{missing[0].name}: missing; expected {missing[0].allowed_in_units}{others}{either}")
     for axis in axes:
         for part in axis.together:
             _check_entry(part, fixed, where)
@@ -259,13 +259,13 @@ def _check_path(scene: Scene) -> None:
         if name in (part.name for part in axis.together) and axis.also:
             others = ", ".join(part.name for part in axis.together if part.name != name)
             raise InputError(
-                f"axes.{axis.shown.name}: {others} would change along the path {name}; allowed is {name} alone"
+                f"axes.{axis.shown.name}: {others} would change along the path {name}; expected {name} alone"
             )
     if name in names and scene.zipped:
-        raise InputError(f"points.{name}: {scene.analysis.name} uses it as a path; allowed is an axis or a fixed value")
+        raise InputError(f"points.{name}: {scene.analysis.name} uses it as a path; expected an axis or a fixed value")
     fixed = isinstance(scene.fixed.get(name), (int, float)) and name not in scene.request.options.values()
     if name not in names and not fixed:
-        allowed = f"allowed is one of {', '.join(names)}" if names else "the scene has no axes"
+        allowed = f"expected one of {', '.join(names)}" if names else "the scene has no axes"
         raise InputError(f"options: {name!r} is not an axis of the scene; {allowed}")
 
 
@@ -277,13 +277,13 @@ def _check_entry(axis: Axis, fixed: Mapping[str, Value], where: str) -> None:
     # An empty list is the default "none".
     if fixed.get(name, ()) == ():
         raise InputError(
-            f"fixed.{name}: missing; {axis.name} varies one entry of this list; allowed is {axis.parameter.allowed}"
+            f"fixed.{name}: missing; {axis.name} varies one entry of this list; expected {axis.parameter.allowed}"
         )
     whole = fixed[name]
     if not isinstance(whole, tuple):
-        raise InputError(f"fixed.{name} = {whole}: {axis.name} varies one entry; allowed is a list of numbers")
+        raise InputError(f"fixed.{name} = {whole}: {axis.name} varies one entry; expected a list of numbers")
     if axis.entry >= len(whole):
-        raise InputError(f"{where}.{axis.name}: allowed is {name}[0] to {name}[{len(whole) - 1}]")
+        raise InputError(f"{where}.{axis.name}: expected {name}[0] to {name}[{len(whole) - 1}]")
 
 
 # Bytes per value of an axis while it is created and checked.
@@ -295,7 +295,7 @@ def axes_of(
 ) -> tuple[tuple[Axis, ...], bool]:
     """The varying parameters; their values are counted before they are computed."""
     if axes and points:
-        raise InputError("points: given together with axes; allowed is one of the two")
+        raise InputError("points: given together with axes; expected one of the two")
     if analysis.continuous:
         _check_ranges(axes, points, analysis)
     swept = {name: _swept_parameter(system, "points" if points else "axes", name) for name in axes or points}
@@ -309,7 +309,7 @@ def axes_of(
     counts = {name: check_count(name, spec, analysis.continuous) for name, (spec, _) in specs.items()}
     total = math.prod(counts.values())
     if total > MAX_POINTS:
-        raise InputError(f"axes: {clipped(str(total))} points; allowed is up to {MAX_POINTS}")
+        raise InputError(f"axes: {clipped(str(total))} points; expected up to {MAX_POINTS}")
     most, present = max(counts.values(), default=0), physical_memory()
     if most * _BYTES > present:
         name = max(counts, key=lambda name: counts[name])
@@ -319,7 +319,7 @@ def axes_of(
 
 def _check_ranges(axes: Mapping[str, Any], points: Mapping[str, Any], analysis: Analysis) -> None:
     if points:
-        raise InputError(f"points: {analysis.name} needs ranges; allowed are axes with start and stop")
+        raise InputError(f"points: {analysis.name} needs ranges; expected axes with start and stop")
     if not 1 <= len(axes) <= MAX_RANGES:
         raise InputError(f"axes: {len(axes)} are given; {analysis.name} allows 1 to {MAX_RANGES}")
 
@@ -329,7 +329,7 @@ def _axis_table(system: type[System], parameter: Parameter, name: str, keys: Any
     if isinstance(keys, list):
         keys = {"values": keys}
     if not isinstance(keys, Mapping):
-        allowed = "allowed is a table { start, stop, num } or { values }, or a row of values"
+        allowed = "expected a table { start, stop, num } or { values }, or a row of values"
         raise InputError(f"axes.{name} = {shown(keys)}: {allowed}")
     if isinstance(num := keys.get("num"), float) and num.is_integer():
         # Options and parameters also accept 1e3 for 1000.
@@ -355,11 +355,11 @@ def _points(points: Mapping[str, Any], system: type[System], swept: Mapping[str,
     """Columns of parameter values of equal length."""
     for name, values in points.items():
         if not isinstance(values, list):
-            raise InputError(f"points.{name} = {shown(values)}: allowed is a list of numbers")
+            raise InputError(f"points.{name} = {shown(values)}: expected a list of numbers")
     lengths = {name: len(values) for name, values in points.items()}
     if len(set(lengths.values())) > 1 or not all(lengths.values()):
         listed = ", ".join(f"{name} has {length}" for name, length in lengths.items())
-        raise InputError(f"points: {listed}; allowed are lists of one length, at least 1")
+        raise InputError(f"points: {listed}; expected lists of one length, at least 1")
     columns = []
     for name, values in points.items():
         table, scalar = in_units(AxisTable(values=values), swept[name], "points.", keep=_is_physical(system, name))
@@ -375,13 +375,11 @@ def _swept_parameter(system: type[System], where: str, name: str) -> Parameter:
     if parameter is None:
         raise InputError(f"{where}.{name}: {unknown_parameter(system, base)}")
     if parameter.choices or parameter.text:
-        raise InputError(f"{where}.{name}: a word cannot vary; allowed is to fix it: {parameter.allowed}")
+        raise InputError(f"{where}.{name}: a word cannot vary; fix it: {parameter.allowed}")
     if not parameter.is_number and entry is None:
-        raise InputError(
-            f'{where}.{name}: a list cannot vary as a whole; allowed is one entry, for example "{name}[0]"'
-        )
+        raise InputError(f'{where}.{name}: a list cannot vary as a whole; expected one entry, for example "{name}[0]"')
     if entry is not None and not parameter.listed:
-        raise InputError(f"{where}.{name}: {base} is not a list; allowed is {base}")
+        raise InputError(f"{where}.{name}: {base} is not a list; expected {base}")
     return replace(parameter, name=name, listed=False, broadcast=False)
 
 
@@ -390,5 +388,5 @@ def unknown_parameter(system: type[System], name: str) -> str:
     data = system.physical.names if system.physical else ()
     parameters = [p.name for p in system.parameters]
     guess = meant(name, described(system).values())
-    listed = f"; allowed is {', '.join(parameters)}" + (f", or physical data: {', '.join(data)}" if data else "")
+    listed = f"; expected {', '.join(parameters)}" + (f", or physical data: {', '.join(data)}" if data else "")
     return f"unknown parameter{guess}{listed}"

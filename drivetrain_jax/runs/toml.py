@@ -40,12 +40,12 @@ def read(
             hint = "; words and numbers with units stand in quotes" * str(error).startswith("Invalid value")
             raise InputError(f"scene = {str(source)!r}: not valid TOML: {error}{hint}") from None
     else:
-        raise InputError(f"scene = {shown(source)}: allowed is the path of a scene file, or a table")
+        raise InputError(f"scene = {shown(source)}: expected the path of a scene file, or a table")
     if overrides:
         text = None
         if not isinstance(overrides, Mapping) or not all(isinstance(key, str) and key for key in overrides):
             raise InputError(
-                f"overrides = {shown(overrides)}: allowed is a table by dotted keys, {{'fixed.zeta': 0.002}}"
+                f"overrides = {shown(overrides)}: expected a table by dotted keys, {{'fixed.zeta': 0.002}}"
             )
         for key, value in overrides.items():
             _replace(tree, key, plain(value))
@@ -73,7 +73,7 @@ def plain(value: Any) -> Any:
             return value.tolist()
         except TypeError:
             raise InputError(
-                "scene: does not work under jax.jit, jax.grad or jax.vmap; allowed is a function such as dt.floquet"
+                "scene: does not work under jax.jit, jax.grad or jax.vmap; expected a function such as dt.floquet"
             ) from None
     if isinstance(value, (Decimal, Fraction)):
         return float(value)

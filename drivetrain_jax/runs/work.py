@@ -297,7 +297,7 @@ def _connect(distributed: Any, address: str, stack: ExitStack) -> Any:
         return stack.enter_context(distributed.Client(place, timeout=_ANSWERED, set_as_default=False))
     except RuntimeError as error:
         where = 'below the line `if __name__ == "__main__":` of the script, which each worker imports'
-        raise InputError(f"workers: do not start ({error}); allowed is a call {where}") from None
+        raise InputError(f"workers: do not start ({error}); expected a call {where}") from None
     except (OSError, ValueError, TypeError) as error:
         # Dask raises TypeError if a TLS address lacks certificates.
         raise InputError(f"dask = {address!r}: no scheduler answers there; {type(error).__name__}") from None
@@ -326,12 +326,12 @@ def make_executor(threads: int | None = None, workers: int | None = None, dask: 
     for name, value in named.items():
         is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
         if name != "dask" and not (is_integer and value >= 1):
-            raise InputError(f"{name} = {shown(value)}: allowed is {name} >= 1, an integer")
+            raise InputError(f"{name} = {shown(value)}: expected {name} >= 1, an integer")
     if dask is not None and not re.match(r"local:[1-9]\d*$|\w+://", str(dask)):
-        raise InputError(f"dask = {dask!r}: allowed is tcp://HOST:PORT or local:N with N >= 1")
+        raise InputError(f"dask = {dask!r}: expected tcp://HOST:PORT or local:N with N >= 1")
     if len(named) > 1:
         first, second, *_ = named
-        raise InputError(f"{first}: given together with {second}; allowed is one of them")
+        raise InputError(f"{first}: given together with {second}; expected one of them")
     return Cluster(dask or f"local:{workers}") if workers or dask else Threads(threads)
 
 

@@ -117,7 +117,7 @@ def refuse_damaged(path: Path, *, rewritten: bool = False) -> None:
     ours = not maker or maker.startswith(b"version=2,h5py=")
     if (rewritten or ours) and (changed := damaged(path)):
         what = f"damaged ({named(changed)})"
-        raise InputError(f"file = {str(path)!r}: {what}; allowed is to restore it or to compute it again") from None
+        raise InputError(f"file = {str(path)!r}: {what}; restore it or compute it again") from None
 
 
 def named(names: list[str]) -> str:

@@ -102,7 +102,7 @@ class PartsFolder:
             except FileNotFoundError:
                 continue
             except PermissionError:
-                raise InputError(f"out = {str(self.path)!r}: not writable; allowed is to move it away") from None
+                raise InputError(f"out = {str(self.path)!r}: not writable; move it away") from None
             # Another run may have removed the folder between mkdir and lock.
             if os.path.exists(file):
                 self._lock = lock
@@ -117,7 +117,7 @@ class PartsFolder:
             # A full disk may have space later.
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise
-            text = f"out = {str(self.path)!r}: {error.strerror}; allowed is a path in a writable folder"
+            text = f"out = {str(self.path)!r}: {error.strerror}; expected a path in a writable folder"
             raise InputError(text) from None
 
     def start(self, plan: Mapping[str, Any]) -> None:

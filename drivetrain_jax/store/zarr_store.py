@@ -222,8 +222,8 @@ def _checksum(arrays: Mapping[str, np.ndarray]) -> int:
 def _damaged(path: Path) -> InputError:
     if "groups" in attributes(path):
         made = "a store of an earlier version, which `drivetrain export` of that version reads"
-        return InputError(f"store = {str(path)!r}: {made}; allowed is a store of this one")
-    return InputError(f"store = {str(path)!r}: damaged; allowed is to restore it or to compute it again")
+        return InputError(f"store = {str(path)!r}: {made}; expected a store of this one")
+    return InputError(f"store = {str(path)!r}: damaged; restore it or compute it again")
 
 
 def _root(path: Path, mode: str = "r") -> Any:

@@ -103,12 +103,10 @@ def register(system: type[System]) -> type[System]:
     -2.0
     """
     if not (isinstance(system, type) and issubclass(system, System) and getattr(system, "name", "")):
-        raise InputError(
-            f"system = {shown(system)}: allowed is a subclass of drivetrain_jax.systems.System with a name"
-        )
+        raise InputError(f"system = {shown(system)}: expected a subclass of drivetrain_jax.systems.System with a name")
     if system.name not in _REGISTERED and system.name in system_names():
         if get_system(system.name) is not system:
-            raise InputError(f"system = {system.name!r}: names an installed system; allowed is another name")
+            raise InputError(f"system = {system.name!r}: names an installed system; expected another name")
         return system
     _REGISTERED[system.name] = system
     return system
@@ -123,5 +121,5 @@ def get_system(name: str) -> type[System]:
     system = load_plugin(SYSTEMS, name, "a system", lambda x: isinstance(x, type) and issubclass(x, System))
     if system is None:
         allowed = ", ".join(system_names())
-        raise KeyError(f"system = {name!r}: allowed is one of {allowed}, or one given to drivetrain_jax.register")
+        raise KeyError(f"system = {name!r}: expected one of {allowed}, or one given to drivetrain_jax.register")
     return system

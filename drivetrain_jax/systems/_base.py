@@ -114,7 +114,7 @@ class PhysicalData:
             if rule.parameter in given:
                 given_text = _shown(given[rule.parameter])
                 raise InputError(
-                    f"{rule.parameter} = {given_text}: given besides {', '.join(rule.needs)}; allowed is one of the two"
+                    f"{rule.parameter} = {given_text}: given besides {', '.join(rule.needs)}; expected one of the two"
                 )
             if missing and not rule.optional:
                 raise InputError(
@@ -136,7 +136,7 @@ class PhysicalData:
                 uses = [
                     f"{rule.parameter} needs {', '.join(rule.needs)}" for rule in self.conversions if name in rule.needs
                 ]
-                raise InputError(f"{name}: nothing follows from it ({'; '.join(uses)}); allowed is to leave it out")
+                raise InputError(f"{name}: nothing follows from it ({'; '.join(uses)}); leave it out")
         return results
 
     def back(self, parameter: str, known: Mapping[str, Any]) -> tuple[Parameter, Callable[[Any], Any]] | None:
@@ -172,7 +172,7 @@ def _evaluated(conversion: Conversion, needs: list[Any]) -> Any:
     lengths = {name: len(v) for name, v, is_listed in zip(conversion.needs, needs, listed, strict=True) if is_listed}
     if len(set(lengths.values())) > 1:
         counts = ", ".join(f"{name} has {count}" for name, count in lengths.items())
-        raise InputError(f"{conversion.needs[0]}: {counts} entries; allowed are lists of one length")
+        raise InputError(f"{conversion.needs[0]}: {counts} entries; expected lists of one length")
     if lengths:
         count = next(iter(lengths.values()))
         entries = [[v[i] if is_listed else v for v, is_listed in zip(needs, listed, strict=True)] for i in range(count)]
@@ -180,7 +180,7 @@ def _evaluated(conversion: Conversion, needs: list[Any]) -> Any:
     axes = list(dict.fromkeys(value.axis for value in needs if isinstance(value, Along)))
     if len(axes) > 1:
         raise InputError(
-            f"axes.{axes[1]}: changes {conversion.parameter} together with {axes[0]}; allowed is one of them as an axis, "
+            f"axes.{axes[1]}: changes {conversion.parameter} together with {axes[0]}; expected one of them as an axis, "
             "or both in [points]"
         )
     value = conversion.value(*(need.values if isinstance(need, Along) else need for need in needs))
@@ -215,7 +215,7 @@ class Model:
     build: Callable[[Values], Any]
     #: Names of the parameters that the model uses.
     parameters: tuple[str, ...]
-    #: ``check(fixed)`` raises ``ValueError`` with one line, ``name = value: allowed is ...``, if parameters in range do not
+    #: ``check(fixed)`` raises ``ValueError`` with one line, ``name = value: expected ...``, if parameters in range do not
     #: match each other. ``fixed`` holds the values that do not vary, and a whole list even if one of its entries varies.
     check: Callable[[Values], None] | None = None
     #: Coordinates of an atlas. None: the parameters, and an atlas only on request (``method = "auto"`` makes none).
@@ -317,7 +317,7 @@ class System(eqx.Module):
         }
         for name, kind in body.get("__annotations__", {}).items():
             if name not in fields and "ClassVar" not in str(kind):
-                raise TypeError(f"{cls.__name__}.{name}: not a parameter; allowed is {name}: Any = parameter(...)")
+                raise TypeError(f"{cls.__name__}.{name}: not a parameter; expected {name}: Any = parameter(...)")
         cls.parameters += tuple(replace(m[_PARAMETER], name=name) for name, m in fields.items() if _PARAMETER in m)
         # For `help`: meaning, range, unit and default of each parameter; the signature has None where there is no default.
         about = []
@@ -339,7 +339,7 @@ class System(eqx.Module):
         """A new system; raises :class:`~drivetrain_jax.InputError` for a name that is no parameter."""
         if values:
             raise InputError(
-                f"{cls.__name__}: {len(values)} values without names; allowed is {cls.__name__}(name=value, ...)"
+                f"{cls.__name__}: {len(values)} values without names; expected {cls.__name__}(name=value, ...)"
             )
         physical = cls.physical.names if cls.physical else ()
         known = [field.name for field in dataclass_fields(cls)]
@@ -347,7 +347,7 @@ class System(eqx.Module):
             if name in physical:
                 raise InputError(f"{name}: physical data; allowed in {cls.__name__}.from_physical(...)")
             if name not in known:
-                raise InputError(f"{name}: unknown{meant(name, cls.parameters)}; allowed is {', '.join(known)}")
+                raise InputError(f"{name}: unknown{meant(name, cls.parameters)}; expected {', '.join(known)}")
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
@@ -380,12 +380,12 @@ class System(eqx.Module):
         0.8616
         """
         if cls.physical is None:
-            raise InputError(f"system = {cls.name!r}: has no physical data; allowed is {cls.__name__}(...)")
+            raise InputError(f"system = {cls.name!r}: has no physical data; expected {cls.__name__}(...)")
         known = {kind.name: kind for kind in (*cls.physical.quantities, *cls.parameters)}
         for name in data:
             if name not in known:
                 guess = meant(name, known.values())
-                raise InputError(f"{name}: unknown{guess}; allowed is {', '.join(known)}")
+                raise InputError(f"{name}: unknown{guess}; expected {', '.join(known)}")
         given = {name: _admitted(known[name], value) for name, value in data.items()}
         values = given | cls.physical.all_converted(given)
         return cls(**{name: value for name, value in values.items() if name not in cls.physical.names})
@@ -399,7 +399,7 @@ class System(eqx.Module):
     def role(cls, name: str) -> str:
         """The parameter with the role ``name``; :class:`~drivetrain_jax.InputError` if there is none."""
         if name not in cls.roles:
-            raise InputError(f"system = {cls.name!r}: has no {name}; allowed is a system whose roles name it")
+            raise InputError(f"system = {cls.name!r}: has no {name}; expected a system whose roles name it")
         return cls.roles[name]
 
     @classmethod
@@ -414,7 +414,7 @@ def _check_names(system: type[System]) -> None:
     for quantity in (*system.parameters, *(system.physical.quantities if system.physical else ())):
         if not is_unit(quantity.units):
             raise InputError(
-                f"{system.__name__}.{quantity.name}: units = {quantity.units!r}; allowed is 1 or units such as N m/rad"
+                f"{system.__name__}.{quantity.name}: units = {quantity.units!r}; expected 1 or units such as N m/rad"
             )
     named = {f"roles[{role!r}]": [name] for role, name in system.roles.items()}
     for analysis, model in system.models.items():
@@ -438,7 +438,7 @@ def _models(system: type[System], method: Any) -> dict[str, Model]:
         model = method(system.of(values))
         if model is None or not isinstance(model, kinds):
             where, allowed = f"{system.__name__}.{method.__name__}", " or ".join(sorted(k.__name__ for k in kinds))
-            raise InputError(f"{where} returned {type(model).__name__}; allowed is a model of the class {allowed}")
+            raise InputError(f"{where} returned {type(model).__name__}; expected a model of the class {allowed}")
         return model
 
     # The source file of a model determines its digest.
@@ -454,7 +454,7 @@ def _admitted(described: Parameter, value: Any) -> Any:
     """``value`` in its stored type, or :class:`InputError`; arrays and traced values are unchanged."""
     if value is None:
         if described.default is None and not described.derived:
-            raise InputError(f"{described.name}: missing; allowed is {described.allowed_in_units}")
+            raise InputError(f"{described.name}: missing; expected {described.allowed_in_units}")
         return None
     if described.choices or described.text:
         return described.check(value)
@@ -471,15 +471,13 @@ def _number(described: Parameter, value: Any) -> Any:
     if isinstance(value, list):
         return np.array([_number(described, entry) for entry in value])
     if np.ma.is_masked(value):
-        raise InputError(f"{described.name}: a masked value; allowed are numbers, {described.allowed_in_units}")
+        raise InputError(f"{described.name}: a masked value; expected numbers, {described.allowed_in_units}")
     if isinstance(value, jax.core.Tracer) or not hasattr(value, "dtype"):
         # A placeholder of a transformation, such as a shape, is no number either.
         return described.check(value) if isinstance(value, _DATA) or hasattr(value, "columns") else value
     whole = np.asarray(value)
     if whole.dtype.kind not in "iuf":
-        raise InputError(
-            f"{described.name}: an array of {whole.dtype}; allowed are numbers, {described.allowed_in_units}"
-        )
+        raise InputError(f"{described.name}: an array of {whole.dtype}; expected numbers, {described.allowed_in_units}")
     for extreme in (whole.min(), whole.max()) if whole.size else ():
         described.check(float(extreme))
     return value if whole.dtype.kind == "f" else whole.astype(float)

@@ -103,11 +103,11 @@ class LinearPeriodic(eqx.Module):
         if any(isinstance(x, jax.core.Tracer) or np.ndim(x) for x in ends):
             return
         if not self.span > 0:
-            raise InputError(f"span = {self.span:g}: allowed is 0 < span")
+            raise InputError(f"span = {self.span:g}: expected 0 < span")
         for i, value in enumerate(self.breakpoints):
             if not ends[i] < value < self.span:
                 raise InputError(
-                    f"breakpoints[{i}] = {value:g}: allowed is {ends[i]:g} < breakpoints[{i}] < {self.span:g}"
+                    f"breakpoints[{i}] = {value:g}: expected {ends[i]:g} < breakpoints[{i}] < {self.span:g}"
                 )
 
     @property
@@ -170,12 +170,10 @@ class LinearPeriodic(eqx.Module):
         """``rows(*basis)``; raises :class:`~drivetrain_jax.InputError` unless they are as many as the entries of each."""
         rows = self.rows(*basis)
         if not isinstance(rows, (tuple, list)) or not all(isinstance(row, (tuple, list)) for row in rows):
-            raise InputError(
-                f"rows: {type(rows).__name__}; allowed are tuples of tuples, ((a, b), (c, d)) for two states"
-            )
+            raise InputError(f"rows: {type(rows).__name__}; expected tuples of tuples, ((a, b), (c, d)) for two states")
         for i, row in enumerate(rows):
             if len(row) != len(rows):
-                raise InputError(f"rows[{i}]: {len(row)} entries; allowed are {len(rows)}, as many as there are rows")
+                raise InputError(f"rows[{i}]: {len(row)} entries; expected {len(rows)}, as many as there are rows")
         return rows
 
     def entries(self, *basis: Any) -> dict[tuple[int, int], Array]:

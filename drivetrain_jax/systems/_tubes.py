@@ -24,7 +24,7 @@ def ring_power(outer: Any, inner: Any, power: int) -> Any:
     xp, outside, inside = numeric(outer, inner)
     # A traced value cannot be checked.
     if xp is np and np.any(inside >= outside):
-        raise InputError(f"inner_diameter = {inner!r}: allowed is less than outer_diameter = {outer!r}")
+        raise InputError(f"inner_diameter = {inner!r}: expected less than outer_diameter = {outer!r}")
     return outside**power - inside**power
 
 

@@ -120,14 +120,14 @@ def check(fixed: Mapping[str, Any]) -> None:
             if isinstance(value, tuple) and value != () and len(value) != needed:
                 raise ValueError(
                     f"{name} = {list(value)}: {counted(len(value), 'entry', 'entries')} where length has {segments}; "
-                    f"allowed is one per {what}, {needed}"
+                    f"expected one per {what}, {needed}"
                 )
     mass = entries_of(fixed.get("rhoA", ()), segments, 1.0)
     for name in ("rhoI", "rhoIp"):
         for i, pair in enumerate(zip(mass, entries_of(fixed.get(name, ()), segments), strict=True)):
             # Traced values are not checked.
             if all(isinstance(x, (int, float)) for x in pair) and pair[0] == 0 < pair[1]:
-                raise ValueError(f"{name}[{i}] = {pair[1]:g}: allowed is 0 for a segment without mass (rhoA[{i}] = 0)")
+                raise ValueError(f"{name}[{i}] = {pair[1]:g}: expected 0 for a segment without mass (rhoA[{i}] = 0)")
 
 
 # Stiffnesses [N m2] and masses per length [kg/m] beyond this range may overflow or underflow on the way to frequencies.

@@ -95,7 +95,7 @@ def _alpha(c2: Any, c1: Any) -> Any:
     xp, c2, c1 = numeric(c2, c1)
     # Without damping of the driving shaft the ratio has no meaning. A traced value cannot be checked.
     if xp is np and np.any((c1 == 0) & (c2 != 0)):
-        raise InputError(f"c2 = {c2.tolist()!r}: allowed is 0 if c1 = 0 (alpha = c2/c1)")
+        raise InputError(f"c2 = {c2.tolist()!r}: expected 0 if c1 = 0 (alpha = c2/c1)")
     return xp.divide(c2, xp.where(c1 == 0, 1.0, c1))
 
 
@@ -118,7 +118,7 @@ def _unit_of_damping(j1: Any, k1: Any) -> Any:
 def _entry(position: int, stiffness: tuple[Any, ...]) -> Any:
     """The stiffness of the driving (0) or of the driven shaft (1)."""
     if len(stiffness) != 2:
-        raise InputError(f"length: got {len(stiffness)} shafts; allowed are two, the driving and the driven one")
+        raise InputError(f"length: got {len(stiffness)} shafts; expected two, the driving and the driven one")
     return stiffness[position]
 
 

@@ -199,7 +199,7 @@ def check(fixed: Values) -> None:
     for name, value in lists.items():
         if len(value) != count:
             raise ValueError(
-                f"{name}: {counted(len(value), 'entry', 'entries')} where {first} has {count}; allowed is one per element"
+                f"{name}: {counted(len(value), 'entry', 'entries')} where {first} has {count}; expected one per element"
             )
     ratio, speed, speeds = fixed.get("ratio", ()), 1.0, []
     for i, (r, b) in enumerate(zip(ratio, fixed.get("beta", ()), strict=False)):
@@ -208,7 +208,7 @@ def check(fixed: Values) -> None:
         if not _is_number(r):
             return
         if r == 0:
-            raise ValueError(f"ratio[{i}] = 0: allowed is a ratio other than 0, negative if it reverses")
+            raise ValueError(f"ratio[{i}] = 0: expected a ratio other than 0, negative if it reverses")
         speed *= r
     if speeds and _half_turns(speeds) is None:
         raise ValueError(

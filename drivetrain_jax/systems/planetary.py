@@ -358,7 +358,7 @@ def driven_springs(values: Values, springs: SpringSystem) -> DrivenSprings:
 
 def _teeth(teeth: tuple[float, ...]) -> tuple[float, ...]:
     if len(teeth) != 3 or not teeth[0] + teeth[1] < teeth[2]:
-        raise InputError(f"teeth = {list(teeth)}: allowed are those of sun, planet and ring, with sun + planet < ring")
+        raise InputError(f"teeth = {list(teeth)}: expected those of sun, planet and ring, with sun + planet < ring")
     return teeth
 
 
@@ -408,9 +408,7 @@ def check(fixed: Mapping[str, Any]) -> None:
     if angles is not None and all(isinstance(angle, (int, float)) for angle in angles):
         apart = [math.remainder(a - b, 2 * math.pi) for i, a in enumerate(angles) for b in angles[:i]]
         if len(angles) > 2 and all(abs(gap) < 1e-9 for gap in apart):
-            raise ValueError(
-                f"planet_angle = {list(angles)}: all planets are in one place; allowed are different angles"
-            )
+            raise ValueError(f"planet_angle = {list(angles)}: all planets are in one place; expected different angles")
         if any(abs(gap) < 1e-9 for gap in apart):
             warnings.warn(f"planet_angle = {list(angles)}: several planets are in one place", stacklevel=2)
     for name in (*PER_PLANET, *ERRORS):
@@ -418,7 +416,7 @@ def check(fixed: Mapping[str, Any]) -> None:
         if isinstance(value, tuple) and angles is not None and len(value) != len(angles):
             raise ValueError(
                 f"{name} = {list(value)}: {counted(len(value), 'entry', 'entries')} where planet_angle has {len(angles)}; "
-                "allowed is one number, or one entry per planet"
+                "expected one number, or one entry per planet"
             )
 
 

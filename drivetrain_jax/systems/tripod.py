@@ -95,7 +95,7 @@ def _check_equation(fixed: Values, allowed: tuple[str, ...]) -> None:
 def check_chi(fixed: Values) -> None:
     """Raise ``ValueError`` if chi_n is given although the option asks for the value of the paper."""
     if "chi_n" in fixed and fixed["chi_source"] != "derived":
-        raise ValueError(f"chi_n = {fixed['chi_n']:g}: given together with chi_source; allowed is one of the two")
+        raise ValueError(f"chi_n = {fixed['chi_n']:g}: given together with chi_source; expected one of the two")
 
 
 # Constants of one element in closed form: the model of the analysis ``parameters``.

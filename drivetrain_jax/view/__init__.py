@@ -34,7 +34,7 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     analysis = str(dataset.attrs.get("analysis"))
     if analysis == "atlas":
         drawn = "what its `grid` and `drivetrain plot` make of it"
-        raise InputError(f"analysis = 'atlas': is a function; allowed is {drawn}")
+        raise InputError(f"analysis = 'atlas': is a function; expected {drawn}")
     plugin = None if analysis in BUILT_IN else _plugin(analysis)
     record = BUILT_IN.get(analysis, Declared())
     if others and plugin is None and not record.overlaid:
@@ -43,7 +43,7 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     for other in others:
         if other.attrs.get("analysis") != analysis:
             raise InputError(
-                f"analysis = {other.attrs.get('analysis')!r}: allowed is the analysis of the first result, {analysis}"
+                f"analysis = {other.attrs.get('analysis')!r}: expected the analysis of the first result, {analysis}"
             )
     # Local imports: matplotlib takes long, and results without a figure need none.
     from matplotlib import rc_context
@@ -54,7 +54,7 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
         return call_plugin(FIGURES, analysis, "figure", plugin, dataset, *others, kind=Figure, allowed=allowed)
     if analysis not in BUILT_IN and "outcome" not in dataset:
         known = ", ".join((*sorted({*BUILT_IN} - {"atlas"}), *plugin_names(FIGURES)))
-        raise InputError(f"analysis = {analysis!r}: has no figure; allowed is one of {known}")
+        raise InputError(f"analysis = {analysis!r}: has no figure; expected one of {known}")
 
     from drivetrain_jax.view.charts import chart, prepare
     from drivetrain_jax.view.style import STYLE

@@ -120,7 +120,7 @@ def wrong_axes(dataset: xr.Dataset, allowed: str) -> InputError:
     """The error for a result over other axes than the ``allowed`` ones; it names axes of one value, too."""
     single = [f"{name} (one value)" for name, c in dataset.coords.items() if c.ndim == 0 and name not in _NO_PARAMETERS]
     axes = ", ".join([*sweep_axes(dataset), *single]) or "none"
-    return InputError(f"axes = {axes}: allowed is {allowed}")
+    return InputError(f"axes = {axes}: expected {allowed}")
 
 
 def require(dataset: xr.Dataset, *names: str, some: bool = False) -> list[str]:
@@ -139,7 +139,7 @@ def require_values(variable: xr.DataArray, positive: bool = False) -> None:
     finite = variable.values[np.isfinite(variable.values)]
     if not (finite.size and (finite.max() > 0 or not positive)):
         kind, largest = "positive" if positive else "finite", finite.max() if finite.size else np.nan
-        raise InputError(f"{variable.name} = {largest:g}: nothing to plot; allowed is a result with a {kind} value")
+        raise InputError(f"{variable.name} = {largest:g}: nothing to plot; expected a result with a {kind} value")
 
 
 def role(dataset: xr.Dataset, name: str) -> str:

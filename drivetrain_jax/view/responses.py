@@ -100,12 +100,12 @@ def _check_comparable(results: list[xr.Dataset]) -> None:
     for other in others:
         for name in first | other:
             if first.get(name) != other.get(name):
-                allowed = f"allowed is the value of the first result, {first.get(name)}"
+                allowed = f"expected the value of the first result, {first.get(name)}"
                 raise InputError(f"{name} = {other.get(name)}: {allowed}")
     labels = [_label(result) for result in results]
     for label in labels:
         if labels.count(label) > 1:
-            raise InputError(f"files: {label!r} is given twice; allowed is every method once")
+            raise InputError(f"files: {label!r} is given twice; expected every method once")
 
 
 def _label(result: xr.Dataset) -> str:

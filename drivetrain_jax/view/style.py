@@ -269,15 +269,15 @@ def listed(units: str | Sequence[str]) -> list[str]:
     """The units of ``"rpm,deg"`` or of a list; raises :class:`InputError` for an unknown one, and for two of one kind."""
     listing = units.split(",") if isinstance(units, str) else units
     if not isinstance(listing, (list, tuple)) or not all(isinstance(unit, str) for unit in listing):
-        raise InputError(f'units = {shown(units)}: allowed are units such as "rpm,deg", or a list of them')
+        raise InputError(f'units = {shown(units)}: expected units such as "rpm,deg", or a list of them')
     names = [unit.strip() for unit in listing]
     for number, unit in enumerate(names):
         try:
             _units.number(f"1 {unit}", unit)
         except _units.UnitError:
-            raise InputError(f"units = {unit!r}: not a unit; allowed are units such as rpm, deg or mm") from None
+            raise InputError(f"units = {unit!r}: not a unit; expected units such as rpm, deg or mm") from None
         if twin := next((other for other in names[:number] if size(unit, other)), None):
-            raise InputError(f"units = {unit!r}: measures the same as {twin}; allowed is one of them")
+            raise InputError(f"units = {unit!r}: measures the same as {twin}; expected one of them")
     return names
 
 
@@ -359,9 +359,9 @@ def check_measured(dataset: xr.Dataset, asked: Iterable[str]) -> None:
 
 
 def allowed_units(units: Iterable[str]) -> str:
-    """``allowed are ...`` with these units."""
+    """``expected ...`` with these units."""
     shown = [written_units(unit) for unit in units if unit not in ("1", "")]
-    return f"allowed are units of {', '.join(shown)}" if shown else "allowed are none, all values are dimensionless"
+    return f"expected units of {', '.join(shown)}" if shown else "expected none, all values are dimensionless"
 
 
 def _assigned(dataset: xr.Dataset, changed: Mapping[Hashable, Any]) -> xr.Dataset:

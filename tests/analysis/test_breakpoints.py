@@ -146,10 +146,10 @@ def test_several_breakpoints():
 @pytest.mark.parametrize(
     ("breakpoints", "message"),
     [
-        ((4.0,), r"breakpoints\[0\] = 4: allowed is 0 < breakpoints\[0\] < 3"),
-        ((0.0,), r"breakpoints\[0\] = 0: allowed is 0 < breakpoints\[0\] < 3"),
-        ((1.0, 1.0), r"breakpoints\[1\] = 1: allowed is 1 < breakpoints\[1\] < 3"),
-        ((1.0, math.nan), r"breakpoints\[1\] = nan: allowed is 1 < breakpoints\[1\] < 3"),
+        ((4.0,), r"breakpoints\[0\] = 4: expected 0 < breakpoints\[0\] < 3"),
+        ((0.0,), r"breakpoints\[0\] = 0: expected 0 < breakpoints\[0\] < 3"),
+        ((1.0, 1.0), r"breakpoints\[1\] = 1: expected 1 < breakpoints\[1\] < 3"),
+        ((1.0, math.nan), r"breakpoints\[1\] = nan: expected 1 < breakpoints\[1\] < 3"),
     ],
 )
 def test_breakpoints_outside_of_the_period_are_refused(breakpoints, message):
@@ -160,8 +160,8 @@ def test_breakpoints_outside_of_the_period_are_refused(breakpoints, message):
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        (jnp.eye(2), r"rows: \w*Array\w*; allowed are tuples of tuples, \(\(a, b\), \(c, d\)\) for two states"),
-        (((0.0, 1.0), (1.0,)), r"rows\[1\]: 1 entries; allowed are 2, as many as there are rows"),
+        (jnp.eye(2), r"rows: \w*Array\w*; expected tuples of tuples, \(\(a, b\), \(c, d\)\) for two states"),
+        (((0.0, 1.0), (1.0,)), r"rows\[1\]: 1 entries; expected 2, as many as there are rows"),
     ],
 )
 def test_rows_that_are_no_square_matrix_are_refused(rows, message):

@@ -303,6 +303,6 @@ def test_a_vanishing_mass_of_the_segments_changes_nothing_until_it_is_refused():
         found = dt.point("bicardan", "critical_speeds", **shaft, rhoA=(mass,) * 4)
         assert found.critical_speed[0] == pytest.approx(3383.848186, rel=1e-9)
     with pytest.raises(
-        dt.InputError, match=r"rhoA\[0\] = 1e-180: allowed is 1e-60 <= rhoA\[i\] <= 1e\+60, or 0, in kg/m"
+        dt.InputError, match=r"rhoA\[0\] = 1e-180: expected 1e-60 <= rhoA\[i\] <= 1e\+60, or 0, in kg/m"
     ):
         dt.point("bicardan", "critical_speeds", **shaft, rhoA=(1e-180,) * 4)

@@ -289,7 +289,7 @@ def test_a_field_that_overflows_needs_infinitely_many_steps():
 
 def test_a_model_of_one_displacement_is_refused():
     model = ForcedModel(lambda t, y: y, lambda t, y: y, 1.0, (0,))
-    with pytest.raises(InputError, match=r"^system: its model has 1 displacements; allowed is 2, as it says$"):
+    with pytest.raises(InputError, match=r"^system: its model has 1 displacements; expected 2, as it says$"):
         predicted_steps(lambda columns: model, 4, 2, {"a": np.ones(1)})
 
 

@@ -150,7 +150,7 @@ def test_options_of_another_method_are_refused():
 
 
 def test_too_few_samples_for_the_harmonics_are_refused():
-    with pytest.raises(InputError, match=r"options.samples = 10: allowed is 0 \(by the harmonics\) or at least 11"):
+    with pytest.raises(InputError, match=r"options.samples = 10: expected 0 \(by the harmonics\) or at least 11"):
         run("harmonic_balance", harmonics=5, samples=10)
 
 

@@ -95,7 +95,7 @@ def test_a_batch_equals_its_points():
 @pytest.mark.parametrize(
     ("parameters", "options", "line"),
     [
-        ({}, {}, "stop = 0: allowed is more than start = 1, in Hz"),
+        ({}, {}, "stop = 0: expected more than start = 1, in Hz"),
         ({"e_s": (1e-6, 1e-6)}, {"stop": 1e3}, "e_s = [1e-06, 1e-06]: 2 entries where planet_angle has 4; "),
     ],
 )

@@ -169,11 +169,11 @@ def test_phase_does_not_drift(end):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "options.times: missing; allowed is times, or stop and num"),
+        ({}, "options.times: missing; expected times, or stop and num"),
         ({"times": [0.1], "stop": 0.2}, "options.stop = 0.2: given together with times"),
-        ({"times": [0.2, 0.1]}, "options.times: allowed are rising times"),
-        ({"times": [-0.1, 0.1]}, r"options.times\[0\] = -0.1: allowed is 0 <= times"),
-        ({"stop": 0.1, "num": 1}, "options.num = 1: allowed is integer 2 <= num"),
+        ({"times": [0.2, 0.1]}, "options.times: expected rising times"),
+        ({"times": [-0.1, 0.1]}, r"options.times\[0\] = -0.1: expected 0 <= times"),
+        ({"stop": 0.1, "num": 1}, "options.num = 1: expected integer 2 <= num"),
     ],
 )
 def test_times_are_checked(options, message):
@@ -225,9 +225,7 @@ def test_a_flow_has_the_components_that_the_system_says():
     defaults = {option.name: option.default for option in history.ANALYSIS.options}
     request = Request(("phi",), "diffrax", defaults | {"times": (1.0,)})
     (solver,) = history.ANALYSIS.solvers(system, request)
-    with pytest.raises(
-        InputError, match=r"^system: its flow has 3 components; allowed is one for each of its state, 2$"
-    ):
+    with pytest.raises(InputError, match=r"^system: its flow has 3 components; expected one for each of its state, 2$"):
         solver.effort({})
 
 

@@ -246,7 +246,7 @@ def test_steps_that_are_given_are_taken():
     for name in OUTPUTS[:3]:
         np.testing.assert_array_equal(ours[name], same[name])
     assert (ours.lyapunov_spectrum != fewer.lyapunov_spectrum).all()
-    with pytest.raises(dt.InputError, match=r"^options\.steps = 0: allowed is integer 4 <= steps <= 1000000$"):
+    with pytest.raises(dt.InputError, match=r"^options\.steps = 0: expected integer 4 <= steps <= 1000000$"):
         tripod(points, steps=0)
 
 
@@ -496,7 +496,7 @@ def test_runs_that_never_end_are_not_begun():
         "fixed": fixed,
     }
     with pytest.raises(
-        dt.InputError, match=r"^options\.max_time = 1e\+300: allowed is 0 < max_time <= 1000000000, in s$"
+        dt.InputError, match=r"^options\.max_time = 1e\+300: expected 0 < max_time <= 1000000000, in s$"
     ):
         dt.run(scene | {"options": {"max_time": 1e300}})
     ours = dt.run(scene | {"options": {"max_time": 0.01}, "outputs": ["lyapunov_spectrum"]})

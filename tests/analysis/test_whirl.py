@@ -265,11 +265,11 @@ def test_a_campbell_diagram(tmp_path):
 def test_wrong_input_is_one_line():
     rotor = {"length": (0.5, 0.5), "EI": (1e4,) * 2, "rhoA": (1.0, 0.0), "k_A": 1e6, "k_D": 1e6}
     cases: tuple[tuple[dict[str, Any], dict[str, Any], str], ...] = (
-        ({"speed": -1.0}, {}, "speed = -1.0: allowed is 0 <= speed < inf, in rad/s"),
-        ({"rhoIp": (0.1, 0.2)}, {}, r"rhoIp\[1\] = 0.2: allowed is 0 for a segment without mass"),
-        ({"k_joint_y": (1.0, 2.0)}, {}, r"k_joint_y = \[1.0, 2.0\]: 2 entries .* allowed is one per joint, 1"),
+        ({"speed": -1.0}, {}, "speed = -1.0: expected 0 <= speed < inf, in rad/s"),
+        ({"rhoIp": (0.1, 0.2)}, {}, r"rhoIp\[1\] = 0.2: expected 0 for a segment without mass"),
+        ({"k_joint_y": (1.0, 2.0)}, {}, r"k_joint_y = \[1.0, 2.0\]: 2 entries .* expected one per joint, 1"),
         ({"k_A_y": 1.0}, {"outputs": "mode_shape", "order": 1}, "'mode_shape' is not computed for two planes"),
-        ({}, {"order": 101}, "order = 101: allowed is integer -100 <= order <= 100"),
+        ({}, {"order": 101}, "order = 101: expected integer -100 <= order <= 100"),
     )
     for values, options, message in cases:
         with pytest.raises(dt.InputError, match=message):

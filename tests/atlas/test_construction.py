@@ -234,5 +234,5 @@ def test_slice_outside_the_domain_is_refused():
     atlas = built(SQUARE, waves, 1e-6)
     with pytest.raises(KeyError, match="z"):
         atlas.slice({"z": 1.0})
-    with pytest.raises(ValueError, match=r"x = 5\.0: allowed is -1 to 2"):
+    with pytest.raises(ValueError, match=r"x = 5\.0: expected -1 to 2"):
         atlas.slice({"x": 5.0})

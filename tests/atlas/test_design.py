@@ -238,7 +238,7 @@ def test_stable_interval_away_from_an_unstable_safe_end(ask, ranges, fixed, spee
 def test_an_atlas_over_other_parameters_is_refused(atlas, ask, at, left, wanted):
     with pytest.raises(InputError) as error:
         ask(atlas, CARDAN, at=at)
-    assert str(error.value) == f"at = {at}: leaves an atlas over {left}; allowed are values that leave {wanted}"
+    assert str(error.value) == f"at = {at}: leaves an atlas over {left}; expected values that leave {wanted}"
 
 
 def test_speed_windows_with_a_margin(atlas):
@@ -295,7 +295,7 @@ def test_narrow_keeps_the_function(atlas):
     points = np.array([[0.3, 0.5], [0.61, 0.57], [0.9, 0.6]])
     values = [Criteria.of(a, CARDAN).propagator(a.to_coordinates(points)) for a in (atlas, part)]
     assert np.abs(values[0] - values[1]).max() < 1e-13 * np.abs(values[0]).max()
-    with pytest.raises(ValueError, match=r"beta = 0\.3 to 1\.3: allowed is a range within 0 to 1\.1"):
+    with pytest.raises(ValueError, match=r"beta = 0\.3 to 1\.3: expected a range within 0 to 1\.1"):
         narrow(atlas, {"beta": (0.3, 1.3)})
     with pytest.raises(KeyError, match="mu"):
         narrow(atlas, {"mu": (0.3, 1.3)})

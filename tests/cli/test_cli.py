@@ -307,7 +307,7 @@ def test_wrong_run_is_one_line_and_writes_nothing(cli, folder, case):
         (("run", "scene.toml", "--out", "r.nc", "--set", "system=cardna"), "(did you mean cardan?)"),
         (
             ("point", "cardan", "floquet"),
-            "beta: missing; allowed is -1.570796327 < beta < 1.570796327, in rad (missing too",
+            "beta: missing; expected -1.570796327 < beta < 1.570796327, in rad (missing too",
         ),
         (("point", "cardan", "floqet"), "analysis = 'floqet': unknown (did you mean floquet?)"),
         (("run",), "the following arguments are required: SCENE.toml, --out; see drivetrain run --help"),
@@ -330,16 +330,16 @@ def test_wrong_run_is_one_line_and_writes_nothing(cli, folder, case):
         (("point", "toy", "toy", "a=1", "sensitivities=true"), "did you mean the option --sensitivities?"),
         (
             ("plot", "r.nc", "s.nc", "--out", "t.csv"),
-            "out = 't.csv': a table shows one whole result; allowed are figures",
+            "out = 't.csv': a table shows one whole result; expected figures",
         ),
         (("plot", "r.nc", "--part", "a=1", "--out", "t.txt"), "out = 't.txt': a table shows one whole result"),
-        (("point", "toy", "toy", "a=" + "9" * 5000), "a = inf: allowed is 0 <= a <= 10"),
+        (("point", "toy", "toy", "a=" + "9" * 5000), "a = inf: expected 0 <= a <= 10"),
         (("plot", "nothing.nc", "--out", "f.png"), "does not exist"),
         (("plot", "scene.toml", "--out", "f.png"), "not a readable"),
         (("plot", "scene.toml", "--out", "nowhere/f.png"), "folder"),
-        (("plot", "scene.toml", "--out", "f.xyz"), "allowed is a name that ends in ."),
+        (("plot", "scene.toml", "--out", "f.xyz"), "expected a name that ends in ."),
         (("plot", ".", "--out", "f.png"), "'.': is a folder; give a result"),
-        (("query", "r.nc", "a=true"), "a = True: allowed is a number or LOW:HIGH"),
+        (("query", "r.nc", "a=true"), "a = True: expected a number or LOW:HIGH"),
         (("plot", "r" * 300, "--out", "f.png"), "rrrr: File name too long"),
     ],
 )
@@ -402,7 +402,7 @@ def test_parts_that_cannot_be_read_are_wrong_input(cli, monkeypatch):
     os.mkdir("r.nc.parts")
     monkeypatch.setattr("drivetrain_jax.runs.output.os.access", lambda path, mode: Path(path).suffix != ".parts")
     code, _, err = cli("run", "scene.toml", "--out", "r.nc")
-    assert (code, len(err)) == (2, 1) and "'r.nc.parts' is no readable folder; allowed is" in err[0]
+    assert (code, len(err)) == (2, 1) and "'r.nc.parts' is no readable folder; expected" in err[0]
 
 
 def test_parts_that_cannot_be_written_are_wrong_input(cli, monkeypatch):
@@ -411,7 +411,7 @@ def test_parts_that_cannot_be_written_are_wrong_input(cli, monkeypatch):
 
     monkeypatch.setattr("drivetrain_jax.store.parts.FileLock.acquire", refuse)
     code, _, err = cli("run", "scene.toml", "--out", "r.nc")
-    assert (code, len(err)) == (2, 1) and "r.nc.parts': not writable; allowed is to move it away" in err[0]
+    assert (code, len(err)) == (2, 1) and "r.nc.parts': not writable; move it away" in err[0]
 
 
 def test_an_interrupt_while_all_is_loaded_counts_nothing(cli, monkeypatch):
@@ -529,11 +529,11 @@ def test_an_analysis_that_fails_spoils_no_other_one(cli, install):
     for line in (
         "  named    copies:NAMED is named modes, not named\n",
         f"  unsound  {fails}\n",
-        "  user     uses = 'floqet': no analysis (did you mean floquet?); allowed is floquet, ",
+        "  user     uses = 'floqet': no analysis (did you mean floquet?); expected floquet, ",
     ):
         assert line in listed and line in system and line in own
     assert "Analysis floquet" in system and "own; analyses: modos: unknown (did you mean modes?), unsound" in listed
-    assert "Analysis modos: unknown (did you mean modes?); allowed is" in own and f"Analysis unsound: {fails}" in own
+    assert "Analysis modos: unknown (did you mean modes?); expected" in own and f"Analysis unsound: {fails}" in own
     code, _, err = cli("point", "cardan", "unsound", "beta=0.1")
     assert (code, err) == (2, [f"drivetrain: analysis = 'unsound': {fails}"])
 
@@ -544,11 +544,11 @@ _RULES = "from drivetrain_jax.invariants import Declared, Rule\n"
 @pytest.mark.parametrize(
     ("group", "code", "wanted"),
     [
-        ("figures", "def X(ds): pass", "figure bad:X returned NoneType; allowed is a matplotlib Figure"),
+        ("figures", "def X(ds): pass", "figure bad:X returned NoneType; expected a matplotlib Figure"),
         ("figures", "def X(ds): ds['q']", "figure bad:X raised KeyError: "),
         ("rules", f"{_RULES}X = Declared((Rule('q > 0', (), lambda ds: ds['q']),))", "rule 'q > 0' of bad:X raised Key"),
-        ("rules", f"{_RULES}X = Declared((Rule('r', (), lambda ds: 1),))", "rule 'r' of bad:X returned int; allowed is "),
-        ("rules", f"{_RULES}X = Declared((Rule('r', 'q', len),))", "variables = 'q': allowed is a tuple of names, ('q',)"),
+        ("rules", f"{_RULES}X = Declared((Rule('r', (), lambda ds: 1),))", "rule 'r' of bad:X returned int; expected "),
+        ("rules", f"{_RULES}X = Declared((Rule('r', 'q', len),))", "variables = 'q': expected a tuple of names, ('q',)"),
         ("rules", f"{_RULES}X = Declared(Rule('r', (), len))", "bad:X cannot be loaded: TypeError: rules: got Rule"),
     ],
 )  # fmt: skip
@@ -597,7 +597,7 @@ def test_several_atlases_are_refused_before_one_is_evaluated(cli, monkeypatch):
     cli("run", "scene.toml", "--out", "r.nc", "--quiet")
     xr.load_dataset("r.nc", engine="h5netcdf").assign_attrs(analysis="atlas").to_netcdf("a.nc", engine="h5netcdf")
     monkeypatch.setattr("drivetrain_jax.runs.atlas_chart.chart", lambda *_: 1 / 0)
-    line = "drivetrain: results: an atlas among several; allowed is an atlas alone, or a chart and its atlas"
+    line = "drivetrain: results: an atlas among several; expected an atlas alone, or a chart and its atlas"
     assert cli("plot", "r.nc", "a.nc", "--out", "f.png") == (2, "", [line])
 
 

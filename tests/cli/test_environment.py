@@ -29,7 +29,7 @@ def drivetrain(*words, **variables):
 def test_a_platform_that_is_not_there_is_one_line(name):
     done = drivetrain(*POINT, JAX_PLATFORMS=name)
     assert done.returncode == 2 and done.stdout == ""
-    said = f"JAX_PLATFORMS = '{name}': jax cannot use it on this machine; allowed is cpu, or to unset the variable"
+    said = f"JAX_PLATFORMS = '{name}': jax cannot use it on this machine; set cpu, or unset the variable"
     assert done.stderr == f"drivetrain: {said}\n"
 
 

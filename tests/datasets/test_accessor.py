@@ -154,9 +154,9 @@ def test_a_chart_shows_the_tongues_of_its_atlas(folder, chart):
     physical = dt.run(CHART | {"axes": axes, "fixed": speeds})
     (mark,) = (x for x in dt.plot(physical, folder / "atlas.nc").axes[0].get_lines() if x.get_label() == "tip")
     assert np.allclose(mark.get_xydata(), [[1.41599 * 2 * 30 / np.pi, np.degrees(0.10633)]], rtol=1e-4)
-    with pytest.raises(dt.InputError, match=r"zeta = 0.01: the atlas is made for zeta = 0.001; allowed is that value"):
+    with pytest.raises(dt.InputError, match=r"zeta = 0.01: the atlas is made for zeta = 0.001; expected that value"):
         dt.plot(dt.run(CHART, overrides={"fixed.zeta": 0.01}), folder / "atlas.nc")
-    with pytest.raises(dt.InputError, match=r"Omega = 0.5: allowed is 1 <= Omega <= 2"):
+    with pytest.raises(dt.InputError, match=r"Omega = 0.5: expected 1 <= Omega <= 2"):
         dt.plot(dt.run(CHART, overrides={"axes.Omega.start": 0.5}), folder / "atlas.nc")
 
 
@@ -166,20 +166,20 @@ def test_a_chart_shows_the_tongues_of_its_atlas(folder, chart):
         (
             ["atlas.nc", "chart.nc"],
             {},
-            "results: an atlas among several; allowed is an atlas alone, or a chart and its atlas",
+            "results: an atlas among several; expected an atlas alone, or a chart and its atlas",
         ),
         (["chart.nc"], {"cells": 5}, "cells = 5: a result on a grid is drawn whole; allowed for an atlas"),
-        ([], {}, "result = []: allowed is a result, or a list of one or more"),
-        (["chart.nc"], {"units": 5}, 'units = 5: allowed are units such as "rpm,deg", or a list of them'),
+        ([], {}, "result = []: expected a result, or a list of one or more"),
+        (["chart.nc"], {"units": 5}, 'units = 5: expected units such as "rpm,deg", or a list of them'),
         (
             ["chart.nc"],
             {"units": ["rpm", 5]},
-            "units = ['rpm', 5]: allowed are units such as \"rpm,deg\", or a list of them",
+            "units = ['rpm', 5]: expected units such as \"rpm,deg\", or a list of them",
         ),
-        (["atlas.nc"], {"cells": "many"}, "cells = 'many': allowed is a whole number, 2 <= cells <= 20000"),
-        (["atlas.nc"], {"part": 5}, "part = 5: allowed are numbers or (low, high) by the name of a parameter"),
-        (["atlas.nc"], {"part": {"beta": [0, 1, 2]}}, "part.beta = [0, 1, 2]: allowed is a number or (low, high)"),
-        ([5], {}, "result: got a int; allowed is a Dataset, the path of a result, or a list of them"),
+        (["atlas.nc"], {"cells": "many"}, "cells = 'many': expected a whole number, 2 <= cells <= 20000"),
+        (["atlas.nc"], {"part": 5}, "part = 5: expected numbers or (low, high) by the name of a parameter"),
+        (["atlas.nc"], {"part": {"beta": [0, 1, 2]}}, "part.beta = [0, 1, 2]: expected a number or (low, high)"),
+        ([5], {}, "result: got a int; expected a Dataset, the path of a result, or a list of them"),
     ],
 )
 def test_what_plot_does_not_take(folder, results, options, message):
@@ -195,10 +195,10 @@ def test_a_grid_without_end_is_not_drawn(folder):
 
 @pytest.mark.full
 def test_what_a_part_lacks_is_named(chart):
-    with pytest.raises(dt.InputError, match="result: without 'outcome', which its figure needs; allowed is a whole"):
+    with pytest.raises(dt.InputError, match="result: without 'outcome', which its figure needs; expected a whole"):
         dt.plot(chart.load().drop_vars("outcome"))
     modes = dt.run({"system": "planetary", "analysis": "modes"})
-    with pytest.raises(dt.InputError, match="result: without 'mode', which a rule needs; allowed is a whole result"):
+    with pytest.raises(dt.InputError, match="result: without 'mode', which a rule needs; expected a whole result"):
         modes.isel(mode=0).drivetrain.verify()
     assert not modes.isel(mode=[0, 1]).drivetrain.verify().problem
 
@@ -215,14 +215,12 @@ def test_wrong_input_of_a_rule_keeps_its_line(chart, monkeypatch):
 
 
 def test_words_are_not_verified(chart):
-    with pytest.raises(
-        dt.InputError, match=r"outcome: no codes; allowed is the result itself, as before \.named\(\) or"
-    ):
+    with pytest.raises(dt.InputError, match=r"outcome: no codes; expected the result itself, as before \.named\(\) or"):
         chart.drivetrain.named().drivetrain.verify()
 
 
 def test_words_are_not_drawn(chart):
-    with pytest.raises(dt.InputError, match="result: has words for codes; allowed is the result itself"):
+    with pytest.raises(dt.InputError, match="result: has words for codes; expected the result itself"):
         chart.drivetrain.named().drivetrain.plot()
 
 

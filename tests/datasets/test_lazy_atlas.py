@@ -243,9 +243,9 @@ def test_axes_of_a_scene_in_physical_data_name_the_results():
     assert float(point["speed"]) == pytest.approx(1425, rel=1e-15) and point["verdict"] == 1
     assert opened(file, {"Omega": 3, "c1": 0.2})["verdict"].dims == ("Omega",)
     for wrong, message in (
-        (lambda: atlas(speed=1600.0, c1=0.2), "speed = 1600: allowed is 1320 <= speed <= 1500, in rpm"),
-        (lambda: atlas(speed="23 Hz"), "c1: missing; allowed is 0.1 <= c1 <= 0.5, in N m s/rad"),
-        (lambda: opened(file, {"speed": 5, "c1": 0.7}), "c1 = 0.7: allowed is 0.1 <= c1 <= 0.5, in N m s/rad"),
+        (lambda: atlas(speed=1600.0, c1=0.2), "speed = 1600: expected 1320 <= speed <= 1500, in rpm"),
+        (lambda: atlas(speed="23 Hz"), "c1: missing; expected 0.1 <= c1 <= 0.5, in N m s/rad"),
+        (lambda: opened(file, {"speed": 5, "c1": 0.7}), "c1 = 0.7: expected 0.1 <= c1 <= 0.5, in N m s/rad"),
         (lambda: opened(file, {"speed": 1}), "grid.speed = 1: is a number of values"),
     ):
         with pytest.raises(dt.InputError) as refused:
@@ -260,16 +260,16 @@ def test_axes_of_a_scene_in_physical_data_name_the_results():
     [
         (
             {"speed": 10},
-            "speed = 10: not a parameter of the atlas; allowed is 0 <= beta <= 0.6, in rad; 1 <= Omega <= 2",
+            "speed = 10: not a parameter of the atlas; expected 0 <= beta <= 0.6, in rad; 1 <= Omega <= 2",
         ),
-        ({"mu": 10}, "mu = 10: the atlas is made for mu = 1; allowed is to leave it out"),
-        ({"beta": 1}, "grid.beta = 1: is a number of values; allowed is 2 or more; 1.0 would fix beta"),
-        ({"Omega": (1.0, 3.0, 5)}, "Omega = 2.5: allowed is 1 <= Omega <= 2"),
-        ({"beta": "wide"}, "grid.beta = 'wide': allowed is a number of values (1000), (START, STOP, NUM), "),
-        ({"beta": True}, "grid.beta = True: allowed is "),
-        ({"beta": np.zeros((2, 2))}, "grid.beta = array([[0., 0.],        [0., 0.]]): allowed is "),
-        ({"beta": 0.1, "Omega": 1.5}, "grid: fixes all parameters; allowed is one that varies, "),
-        ("all", "grid = 'all': allowed is a number of values, or a table by the names of parameters"),
+        ({"mu": 10}, "mu = 10: the atlas is made for mu = 1; leave it out"),
+        ({"beta": 1}, "grid.beta = 1: is a number of values; expected 2 or more; 1.0 would fix beta"),
+        ({"Omega": (1.0, 3.0, 5)}, "Omega = 2.5: expected 1 <= Omega <= 2"),
+        ({"beta": "wide"}, "grid.beta = 'wide': expected a number of values (1000), (START, STOP, NUM), "),
+        ({"beta": True}, "grid.beta = True: expected "),
+        ({"beta": np.zeros((2, 2))}, "grid.beta = array([[0., 0.],        [0., 0.]]): expected "),
+        ({"beta": 0.1, "Omega": 1.5}, "grid: fixes all parameters; expected one that varies, "),
+        ("all", "grid = 'all': expected a number of values, or a table by the names of parameters"),
     ],
 )
 def test_grids_that_are_none(file, grid, message):
@@ -279,11 +279,11 @@ def test_grids_that_are_none(file, grid, message):
 
 
 def test_files_that_are_none(tmp_path, file):
-    with pytest.raises(dt.InputError, match=r"gaps = 'fill': allowed is one of solve, nan"):
+    with pytest.raises(dt.InputError, match=r"gaps = 'fill': expected one of solve, nan"):
         opened(file, gaps="fill")
     with pytest.raises(dt.InputError, match=r"none.nc': No such file"):
         opened(tmp_path / "none.nc")
-    with pytest.raises(dt.InputError, match="allowed is the path of the file of an atlas"):
+    with pytest.raises(dt.InputError, match="expected the path of the file of an atlas"):
         opened(memoryview(b""))
     damaged = tmp_path / "damaged.nc"
     shutil.copy(file, damaged)
@@ -298,7 +298,7 @@ def test_a_file_that_changes_is_not_mixed_with_another(tmp_path, file):
     shutil.copy(file, copy)
     found = opened(copy)
     os.utime(copy, ns=(0, 0))
-    with pytest.raises(dt.InputError, match="has changed since it was opened; allowed is to open it again"):
+    with pytest.raises(dt.InputError, match="has changed since it was opened; open it again"):
         found["verdict"].values  # noqa: B018
     assert opened(copy)["verdict"].isel(beta=0).values.shape == (400,)
 

@@ -206,7 +206,7 @@ def test_a_result_that_has_lost_its_checksums_is_not_sound(chart, tmp_path):
     with h5py.File(path, "r+") as file:
         del file.attrs["checksums"]
     report = verify(path)
-    assert report.lines == ("checksums: gone",) and "its checksums are gone; allowed is to restore" in report.problem
+    assert report.lines == ("checksums: gone",) and "its checksums are gone; restore" in report.problem
 
 
 def test_verify_unfinished_work(tmp_path):

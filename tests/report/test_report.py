@@ -129,7 +129,7 @@ def test_units_are_those_asked_for_or_those_of_the_scene(truck, tmp_path):
 @pytest.mark.full
 def test_a_unit_that_nothing_measures_is_refused(truck, files, tmp_path, capsys):
     for option, value, words in (
-        ("--units", "kg m", "units = 'kg m': nothing in the report measures that; allowed are units of"),
+        ("--units", "kg m", "units = 'kg m': nothing in the report measures that; expected units of"),
         ("--units", "rpm,Hz", "units = 'Hz': measures the same as rpm"),
         ("--amplitude", "2 deg", "amplitude = '2 deg': no result has a forced motion to compare"),
         ("--amplitude", "2 mm", "mm is a unit of another quantity"),

@@ -95,7 +95,7 @@ def test_the_ends_of_an_atlas_may_be_given_in_other_units(J1, k1):
     exact = atlas_answers.widest_angle(atlas, {"Omega": (1.3, 1.5)}).data["value"]
     for speed in (ends, tuple(float(f"{end:.10g}") for end in ends)):
         assert atlas_answers.widest_angle(atlas, {**data, "speed": speed}).data["value"] == exact
-    with pytest.raises(dt.InputError, match=r"^speed = .*: allowed is speed=LOW:HIGH within"):
+    with pytest.raises(dt.InputError, match=r"^speed = .*: expected speed=LOW:HIGH within"):
         atlas_answers.widest_angle(atlas, {**data, "speed": (ends[0] * (1 - 1e-8), ends[1])})
 
 
@@ -314,7 +314,7 @@ def test_very_little_damping_is_not_zero_damping():
     atlas = atlas_of((0.0, 1.2), (0.3, 2.0), zeta=0.0)
     point = {"beta": 0.00005, "Omega": 1.4159846397}
     assert atlas_answers.query(atlas, point).data["meanings"]["verdict"] == "unstable"
-    with pytest.raises(dt.InputError, match=r"^zeta = 1e-09: the atlas is made for zeta = 0; allowed is that value$"):
+    with pytest.raises(dt.InputError, match=r"^zeta = 1e-09: the atlas is made for zeta = 0; expected that value$"):
         atlas_answers.query(atlas, {**point, "zeta": 1e-9})
 
 
@@ -393,7 +393,7 @@ def test_a_question_may_repeat_what_follows_from_the_data_of_the_atlas():
         ({"mu": 0.5}, r"^mu = 0\.5: the atlas is made for mu = 0\.6666"),
         (
             {"zeta": 0.0005, "c1": 1.0, "c2": 0.4082},
-            r"^zeta = 0\.0005: given besides c1, J1, k1; allowed is one of the two",
+            r"^zeta = 0\.0005: given besides c1, J1, k1; expected one of the two",
         ),
     ):
         with pytest.raises(dt.InputError, match=message):
@@ -459,7 +459,7 @@ def test_an_atlas_without_a_panel_answers_by_direct_solves(monkeypatch):
     assert reply.text.splitlines()[-1].startswith("  unknown: the atlas has no panel (")
     assert reply.data["nearest"] == {} and "boundary_beta" not in chart(source, {}, 4).coords
     with pytest.raises(
-        dt.InputError, match=r"^file: the atlas has no panel \(.*\); allowed is one whose solves converged$"
+        dt.InputError, match=r"^file: the atlas has no panel \(.*\); expected one whose solves converged$"
     ):
         atlas_answers.widest_angle(atlas, {"Omega": (0.001, 0.002)})
 
@@ -517,7 +517,7 @@ def test_a_part_of_an_atlas_is_refused(name):
     whole = panels((0.2, 0.3), (1.3, 1.5))
     attrs = {key: value for key, value in whole.attrs.items() if key != name}
     part = whole.drop_vars(name, errors="ignore").drop_attrs().assign_attrs(attrs)
-    with pytest.raises(dt.InputError, match=f"^dataset: lacks {name}; allowed is the whole result of a scene"):
+    with pytest.raises(dt.InputError, match=f"^dataset: lacks {name}; expected the whole result of a scene"):
         dt.open_atlas(part)
 
 

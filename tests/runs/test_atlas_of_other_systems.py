@@ -95,7 +95,7 @@ def test_wrong_units_and_other_fixed_values_are_refused(atlas, values, words):
 
 
 def test_traced_numbers_are_refused_in_one_line(atlas):
-    with pytest.raises(InputError, match=r"^omega = [^\n]*: allowed are numbers"):
+    with pytest.raises(InputError, match=r"^omega = [^\n]*: expected numbers"):
         jax.jit(lambda omega: atlas(omega=omega).spectral_radius.values)(1.1)
 
 
@@ -109,7 +109,7 @@ def test_an_integer_is_no_range_of_an_atlas(monkeypatch):
     chart = {"system": "pendulum", "analysis": "floquet", "axes": many, "fixed": {"depth": 0.3}}
     monkeypatch.setattr(resolve_module, "_WORTHWHILE", 0)
     assert choose_atlas(load_scene(chart)) is None
-    with pytest.raises(InputError, match="order is an integer; allowed are auto and direct"):
+    with pytest.raises(InputError, match="order is an integer; expected auto and direct"):
         choose_atlas(load_scene(chart | {"options": {"method": "atlas"}}))
 
 

@@ -152,13 +152,13 @@ def test_threads_are_reused_except_after_an_interrupt():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"threads": 0}, "threads = 0: allowed is threads >= 1"),
-        ({"threads": "2"}, "threads = '2': allowed is threads >= 1, an integer"),
-        ({"threads": True}, "threads = True: allowed is threads >= 1, an integer"),
-        ({"workers": 1.5}, "workers = 1.5: allowed is workers >= 1, an integer"),
-        ({"dask": 5}, "dask = 5: allowed is tcp://HOST:PORT or local:N"),
+        ({"threads": 0}, "threads = 0: expected threads >= 1"),
+        ({"threads": "2"}, "threads = '2': expected threads >= 1, an integer"),
+        ({"threads": True}, "threads = True: expected threads >= 1, an integer"),
+        ({"workers": 1.5}, "workers = 1.5: expected workers >= 1, an integer"),
+        ({"dask": 5}, "dask = 5: expected tcp://HOST:PORT or local:N"),
         ({"threads": 1, "workers": 1}, "threads: given together with workers"),
-        ({"dask": "localhost"}, "dask = 'localhost': allowed is tcp://HOST:PORT or local:N"),
+        ({"dask": "localhost"}, "dask = 'localhost': expected tcp://HOST:PORT or local:N"),
         ({"dask": "tcp://127.0.0.1:1"}, "dask = 'tcp://127.0.0.1:1': no scheduler answers"),
     ],
 )

@@ -84,7 +84,7 @@ def test_limits_that_mean_nothing_are_refused(capsys):
     for words, message in (
         ([*WORDS, "speed=2000", "--amplitude", "2"], 'did you mean "2 deg"?'),
         ([*WORDS, "speed=2000", "--amplitude", "2 kg"], "kg is a unit of another quantity"),
-        ([*WORDS, "speed=2000", "--amplitude", "-1 deg"], "allowed is 0 < amplitude"),
+        ([*WORDS, "speed=2000", "--amplitude", "-1 deg"], "expected 0 < amplitude"),
     ):
         assert main(["point", "cardan", "floquet", *words]) == 2
         assert message in capsys.readouterr().err

@@ -62,12 +62,12 @@ def test_physical_units():
     assert "from J1 = 2 kg m2, " in repr(found) and "physical" not in json.loads(exact.to_json())
     for given, message in (
         ({"J1": 2.0, "speed": 300.0}, "k1: missing; Omega = speed sqrt(J1/k1) needs k1"),
-        ({**data, "speed": "fast", "angle": 1.0}, "speed = 'fast': allowed is a number, 0 < speed < inf"),
+        ({**data, "speed": "fast", "angle": 1.0}, "speed = 'fast': expected a number, 0 < speed < inf"),
         (
             {**data, "speed": 300.0, "angle": 18.0, "zeta": 0.4},
-            "zeta = 0.4: given besides c1, J1, k1; allowed is one of the two",
+            "zeta = 0.4: given besides c1, J1, k1; expected one of the two",
         ),
-        ({**data, "angle": 90.0, "speed": 1.0}, "angle = 90.0: allowed is -90 < angle < 90, in deg"),
+        ({**data, "angle": 90.0, "speed": 1.0}, "angle = 90.0: expected -90 < angle < 90, in deg"),
     ):
         with pytest.raises(dt.InputError, match=f"^{re.escape(message)}$"):
             dt.point("cardan", "floquet", **given)
@@ -75,7 +75,7 @@ def test_physical_units():
 
 def test_angles_of_planets_in_degrees_are_refused():
     with pytest.raises(
-        dt.InputError, match=r'^planet_angle\[1\] = 120: allowed is .*, in rad; did you mean "120 deg"\?$'
+        dt.InputError, match=r'^planet_angle\[1\] = 120: expected .*, in rad; did you mean "120 deg"\?$'
     ):
         dt.point("planetary", "modes", planet_angle=[0, 120, 240])
 
@@ -140,18 +140,18 @@ def test_another_point_needs_no_new_compilation():
 @pytest.mark.parametrize(
     ("given", "part"),
     [
-        ({"a": 11}, "^a = 11: allowed is 0 <= a <= 10, in m$"),
-        ({"a": "x"}, "^a = 'x': allowed is a number"),
+        ({"a": 11}, "^a = 11: expected 0 <= a <= 10, in m$"),
+        ({"a": "x"}, "^a = 'x': expected a number"),
         ({"a": [1.0]}, "^a = "),
         ({}, "^a: missing"),
-        ({"a": 1, "c": 2}, "^c = 2: unknown; allowed is a, b"),
+        ({"a": 1, "c": 2}, "^c = 2: unknown; expected a, b"),
         ({"a": 1, "rtol": 2}, "^rtol = 2"),
         ({"a": 1, "knob": 2}, "^knob = 2: not used by method plain"),
         ({"a": 1, "kind": "odd"}, "^kind = 'odd'"),
         ({"a": 1, "outputs": ["nothing"]}, "^outputs: 'nothing'"),
         ({"a": 1, "outputs": 5}, "^outputs = 5: expected `array"),
         ({"a": 1, "outputs": True}, "^outputs = True: expected `array"),
-        ({"a": 1j}, "^a = 1j: allowed is a number"),
+        ({"a": 1j}, "^a = 1j: expected a number"),
     ],
 )
 def test_wrong_input_is_one_clear_line(given, part):

@@ -264,7 +264,7 @@ def test_unfinished_work_is_resumed_only_with_the_same_reused_points(tmp_path):
 
     with pytest.raises(Interrupted):
         run_to_file(LARGE, path, executor=Threads(1), report=stop, reuse=[small])
-    with pytest.raises(InputError, match=r"takes points from small.nc; allowed is the same again, or --fresh"):
+    with pytest.raises(InputError, match=r"takes points from small.nc; expected the same again, or --fresh"):
         run_to_file(LARGE, path)
     assert status(LARGE, path).done > 22
     assert run_to_file(LARGE, path, reuse=[small]).reused > 22
@@ -373,7 +373,7 @@ def test_damaged_values_do_not_enter_another_result(tmp_path):
         file["value"][1, 3] = -7.0
     with pytest.raises(InputError, match=r"holds a damaged result \(value\); --fresh replaces it"):
         run_to_file(LARGE, path)
-    with pytest.raises(InputError, match=r"r.nc': damaged \(value\); allowed is to restore"):
+    with pytest.raises(InputError, match=r"r.nc': damaged \(value\); restore"):
         run_to_file(LARGE, tmp_path / "new.nc", reuse=[path])
     with h5py.File(path, "r+") as file:
         del file.attrs["checksums"]

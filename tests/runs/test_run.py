@@ -357,7 +357,7 @@ def test_a_finished_result_in_a_folder_without_write_permission_is_read(grid_sce
     assert run_to_file(grid_scene, path).reused == 123 and status(grid_scene, path).state == "complete"
     assert_same(dt.run(grid_scene, path), dt.run(grid_scene))
     for fresh, name in ((True, "r.nc"), (False, "new.nc")):
-        with pytest.raises(dt.InputError, match="allowed is a path in a writable folder"):
+        with pytest.raises(dt.InputError, match="expected a path in a writable folder"):
             run_to_file(grid_scene, tmp_path / name, fresh=fresh)
     assert os.listdir(tmp_path) == ["r.nc"]
 
@@ -420,18 +420,18 @@ GOOD = {"wave": np.ones(3), "outcome": 0}
 @pytest.mark.parametrize(
     ("found", "dim", "message"),
     [
-        (None, "part", "solve returned NoneType; allowed is a dict of wave, outcome"),
-        ({"outcome": 0}, "part", "solve returned outcome, not wave; allowed is wave, outcome"),
-        ({"wave": np.ones(3)}, "part", "solve returned wave, not outcome; allowed is wave, outcome"),
+        (None, "part", "solve returned NoneType; expected a dict of wave, outcome"),
+        ({"outcome": 0}, "part", "solve returned outcome, not wave; expected wave, outcome"),
+        ({"wave": np.ones(3)}, "part", "solve returned wave, not outcome; expected wave, outcome"),
         (
             GOOD | {"waves": 1},
             "part",
-            "solve returned 'waves', which is not declared (did you mean wave?); allowed is ",
+            "solve returned 'waves', which is not declared (did you mean wave?); expected ",
         ),
-        (GOOD | {"wave": np.ones(4)}, "part", "wave has the shape (4,); allowed is (part = 3, lanes)"),
-        (GOOD | {"wave": 1.0}, "part", "wave has the shape (); allowed is (part = 3, lanes)"),
-        (GOOD | {"wave": None}, "part", "wave is of type NoneType; allowed is an array (part = 3, lanes)"),
-        (GOOD, "parts", "wave has the dimension 'part' (did you mean parts?); allowed is parts"),
+        (GOOD | {"wave": np.ones(4)}, "part", "wave has the shape (4,); expected (part = 3, lanes)"),
+        (GOOD | {"wave": 1.0}, "part", "wave has the shape (); expected (part = 3, lanes)"),
+        (GOOD | {"wave": None}, "part", "wave is of type NoneType; expected an array (part = 3, lanes)"),
+        (GOOD, "parts", "wave has the dimension 'part' (did you mean parts?); expected parts"),
     ],
 )
 @pytest.mark.parametrize("into", ["scene", "function"])

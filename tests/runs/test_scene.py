@@ -149,7 +149,7 @@ WRONG = {
     "no output": (changed(outputs=[]), "outputs = []", "value"),
     "output twice": (changed(outputs=["value", "value"]), "outputs", "once"),
     "unknown parameter": (changed(fixed={"bb": 1}), "fixed.bb = 1", "did you mean b?"),
-    "unknown axis": (changed(axes={"x": {"values": [1]}}), "axes.x", "allowed is a, b"),
+    "unknown axis": (changed(axes={"x": {"values": [1]}}), "axes.x", "expected a, b"),
     "missing parameter": (changed(axes={}), "fixed.a: missing", "0 <= a <= 10"),
     "parameter of the wrong type": (changed(fixed={"b": "two"}), "fixed.b = 'two'", "number"),
     "boolean for a number": (changed(fixed={"b": True}), "b = True", "number"),
@@ -168,13 +168,13 @@ WRONG = {
     "one point of two ends": (
         changed(axes={"a": {"start": 0, "stop": 1, "num": 1}}),
         "axes.a.num = 1: start = 0 and stop = 1 are two values",
-        "allowed is num >= 2, or values = [0]",
+        "expected num >= 2, or values = [0]",
     ),
     "no points on an axis": (changed(axes={"a": {"start": 0, "stop": 1, "num": 0}}), "axes.a.num = 0", "num >= 1"),
     "num of many digits": (
         changed(axes={"a": {"start": 0, "stop": 1, "num": 1e300}}),
         "axes: 100000000000000005250476025520442024870446858110815915491... points",
-        "allowed is up to",
+        "expected up to",
     ),
     "num not finite": (
         changed(axes={"a": {"start": 0, "stop": 1, "num": float("inf")}}),
@@ -222,12 +222,12 @@ WRONG = {
     "result that this system lacks": (
         {"system": "cardan", "analysis": "floquet", "outputs": ["floquet_exponents"]},
         "'floquet_exponents'",
-        "allowed is floquet_multiplier, floquet_multiplier_error, spectral_radius,",
+        "expected floquet_multiplier, floquet_multiplier_error, spectral_radius,",
     ),
     "method that this system lacks": (
         {"system": "tripod", "analysis": "floquet", "options": {"method": "magic"}},
         "options.method = 'magic'",
-        "allowed is auto, direct, diffrax",
+        "expected auto, direct, diffrax",
     ),
     "num beside times": (
         {**HISTORY, "options": {"times": [0.0, 1.0], "num": 5}},
@@ -244,7 +244,7 @@ WRONG = {
         "points.length[2]",
         "length[0] to length[1]",
     ),
-    "long list for a number": (changed(fixed={"b": [0.5] * 1000}), "fixed.b = [0.5, 0.5,", "...: allowed"),
+    "long list for a number": (changed(fixed={"b": [0.5] * 1000}), "fixed.b = [0.5, 0.5,", "...: expected"),
     "list of one": (
         {"system": "planetary", "analysis": "modes", "fixed": {"planet_angle": [0.0, 2.0], "m_p": [1.0]}},
         "fixed.m_p = [1.0]: 1 entry where planet_angle has 2",
@@ -255,7 +255,7 @@ WRONG = {
         "fixed.weight = 1.0",
         "list",
     ),
-    "path that is no axis": (follow(options={"track": "c"}), "options: 'c'", "allowed is one of length[0]"),
+    "path that is no axis": (follow(options={"track": "c"}), "options: 'c'", "expected one of length[0]"),
     "path that is a number": (follow(options={"track": 3}), "options.track = 3", "text"),
     "no infinity": (changed(fixed={"b": math.inf}), "fixed.b = inf", "0 < b"),
     "whole list as axis": (changed(axes={"length": {"values": [1]}}), "axes.length", '"length[0]"'),
@@ -321,7 +321,7 @@ def test_wrong_file_is_one_clear_line(tmp_path, content, part):
 
 @pytest.mark.parametrize("overrides", [{5: 1}, {"": 1}, [1], "fixed.a"])
 def test_wrong_overrides_are_one_clear_line(overrides):
-    with pytest.raises(InputError, match=r"overrides = .*allowed is a table by dotted keys"):
+    with pytest.raises(InputError, match=r"overrides = .*expected a table by dotted keys"):
         load_scene(GOOD, overrides)
 
 
@@ -332,5 +332,5 @@ def test_a_byte_order_mark_and_line_ends_of_windows_are_read(tmp_path):
 
 
 def test_huge_axis_is_refused_before_it_is_created():
-    with pytest.raises(InputError, match="allowed is up to 2000000000"):
+    with pytest.raises(InputError, match="expected up to 2000000000"):
         load_scene(changed(axes={"a": {"start": 0, "stop": 1, "num": 10**15}}))

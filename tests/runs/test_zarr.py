@@ -84,7 +84,7 @@ def test_the_name_chooses_the_store(tmp_path):
     run_to_file(ONE, tmp_path / "r.zarr")
     assert zarr_store.is_store(tmp_path / "r.zarr") and status(ONE, tmp_path / "r.zarr").state == "complete"
     for refused in (lambda out: run_to_file(ONE, out, store="hdf5"), lambda out: run(ONE, out)):
-        with pytest.raises(InputError, match=r"names a Zarr store; allowed is a name such as s\.nc"):
+        with pytest.raises(InputError, match=r"names a Zarr store; expected a name such as s\.nc"):
             refused(tmp_path / "s.zarr")
     assert [path.name for path in tmp_path.iterdir()] == ["r.zarr"]
 
@@ -185,7 +185,7 @@ def test_export_leaves_unfinished_work_alone(grid_scene, tmp_path):
         run_to_file(grid_scene, tmp_path / "e.nc", executor=Threads(1), report=stop_after(2))
     done = status(grid_scene, tmp_path / "e.nc").done
     with pytest.raises(
-        InputError, match=r"out = .*e.nc': allowed is a new file in an existing folder, without unfinished work"
+        InputError, match=r"out = .*e.nc': expected a new file in an existing folder, without unfinished work"
     ):
         export(tmp_path / "r.zarr", tmp_path / "e.nc")
     assert status(grid_scene, tmp_path / "e.nc").done == done > 0
@@ -321,8 +321,8 @@ def test_the_command_line(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     for arguments, part in [
         (["export", "nothing", "f.nc"], "not a Zarr store"),
-        (["export", "r.zarr", "e.nc"], "allowed is a new file"),
-        (["export", "r.zarr", "nowhere/e.nc"], "allowed is a new file"),
+        (["export", "r.zarr", "e.nc"], "expected a new file"),
+        (["export", "r.zarr", "nowhere/e.nc"], "expected a new file"),
         (["run", "scene.toml", "--out", "e.nc", "--store", "zarr"], "is a file"),
         (["run", "scene.toml", "--out", "d"], "is a folder"),
         (["run", "scene.toml", "--out", "r.zarr", "--store", "hdf5"], "names a Zarr store"),

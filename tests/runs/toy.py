@@ -144,7 +144,7 @@ def _lengths_and_weights(fixed) -> None:
     weight = fixed.get("weight")
     if isinstance(weight, tuple) and len(weight) != len(fixed["length"]):
         counts = f"{len(weight)} entries where length has {len(fixed['length'])}"
-        raise ValueError(f"weight = {list(weight)}: {counts}; allowed is equally many")
+        raise ValueError(f"weight = {list(weight)}: {counts}; expected equally many")
 
 
 def _analysis(name: str, solvers, methods=None) -> Analysis:

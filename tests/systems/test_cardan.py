@@ -280,7 +280,7 @@ def test_parameter_ranges(name, good, bad):
     assert parameter.units == ("rad" if name == "beta" else "1")
     assert all(parameter.check(value) == value for value in good)
     for value in (*bad, math.nan, math.inf, "1", True):
-        with pytest.raises(ValueError, match=f"^{name} = .*allowed is"):
+        with pytest.raises(ValueError, match=f"^{name} = .*expected"):
             parameter.check(value)
 
 
@@ -301,7 +301,7 @@ def test_systems_are_found_by_name():
     assert system_names()[0] == "cardan"
     assert SYSTEM.name == "cardan"
     assert set(SYSTEM.models) == {"floquet", "atlas", "forced", "frequency_response", "history", "lyapunov"}
-    with pytest.raises(KeyError, match="allowed is one of cardan"):
+    with pytest.raises(KeyError, match="expected one of cardan"):
         get_system("cardn")
 
 

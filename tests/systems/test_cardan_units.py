@@ -70,11 +70,11 @@ def test_way_back():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"J1": 0.0}, "J1 = 0.0: allowed is 0 < J1"),
-        ({"angle": 90.0}, "angle = 90.0: allowed is -90 < angle < 90"),
-        ({"speed": -1.0}, "speed = -1.0: allowed is 0 < speed"),
-        ({"c1": 0.0}, "c2 = 1.5: allowed is 0 if c1 = 0"),
-        ({"k2": math.nan}, "k2 = nan: allowed is"),
+        ({"J1": 0.0}, "J1 = 0.0: expected 0 < J1"),
+        ({"angle": 90.0}, "angle = 90.0: expected -90 < angle < 90"),
+        ({"speed": -1.0}, "speed = -1.0: expected 0 < speed"),
+        ({"c1": 0.0}, "c2 = 1.5: expected 0 if c1 = 0"),
+        ({"k2": math.nan}, "k2 = nan: expected"),
     ],
 )
 def test_wrong_input(change, message):

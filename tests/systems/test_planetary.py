@@ -42,7 +42,7 @@ def test_lists_have_one_entry_per_planet():
     scene = SCENE | {"fixed": {"m_p": [1.0, 2.0]}, "axes": {"k_p": {"values": [1e8]}}}
     with pytest.raises(InputError) as refusal:
         load_scene(scene)
-    said = "fixed.m_p = [1.0, 2.0]: 2 entries where planet_angle has 4; allowed is one number, or one entry per planet"
+    said = "fixed.m_p = [1.0, 2.0]: 2 entries where planet_angle has 4; expected one number, or one entry per planet"
     assert str(refusal.value) == said
 
 
@@ -54,9 +54,7 @@ def test_planets_in_one_place_are_warned_of(angles):
 
 
 def test_planets_that_are_all_in_one_place_are_refused():
-    with pytest.raises(
-        InputError, match=r"planet_angle = \[0.0, 0.0, 0.0\]: all planets are in one place; allowed are"
-    ):
+    with pytest.raises(InputError, match=r"planet_angle = \[0.0, 0.0, 0.0\]: all planets are in one place; expected"):
         load_scene(SCENE | {"fixed": {"planet_angle": [0.0, 0.0, 0.0]}})
 
 
@@ -182,5 +180,5 @@ def test_one_of_five_planets_3_degrees_off():
 
 @pytest.mark.parametrize("track", ["m_s", "pressure_angle", "planet_angle"])
 def test_a_track_is_an_axis(track):
-    with pytest.raises(InputError, match=f"options: '{track}' is not an axis of the scene; allowed is one of k_cu"):
+    with pytest.raises(InputError, match=f"options: '{track}' is not an axis of the scene; expected one of k_cu"):
         load_scene(SCENE | {"axes": {"k_cu": {"values": [1e8, 1e9]}}, "options": {"track": track}})

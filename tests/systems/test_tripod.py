@@ -142,8 +142,8 @@ def test_determinant_against_quadrature():
         ("floquet", {"equation": "25"}, "equation = '25'.* input element is 29"),
         ("floquet", {"chi_n": 0.0026, "chi_source": "printed_value"}, "chi_n = 0.0026: given together with chi_source"),
         ("floquet", {"beta": math.pi / 2}, "beta = 1.57"),
-        ("floquet", {"zeta": 0.0}, "zeta = 0.0: allowed is 0 < zeta"),
-        ("floquet", {"element": "middle"}, "allowed is one of input, output"),
+        ("floquet", {"zeta": 0.0}, "zeta = 0.0: expected 0 < zeta"),
+        ("floquet", {"element": "middle"}, "expected one of input, output"),
     ],
 )
 def test_wrong_input_is_one_line(analysis, given, message):
@@ -159,7 +159,7 @@ def test_exponents_need_a_time_in_seconds():
     scene = {"system": "cardan", "analysis": "floquet", "outputs": ["floquet_exponent"], "fixed": fixed}
     with pytest.raises(
         InputError,
-        match="'floquet_exponent': a rate in 1/s, and the time of cardan has no unit; allowed",
+        match="'floquet_exponent': a rate in 1/s, and the time of cardan has no unit; expected",
     ):
         load_scene(scene)
 

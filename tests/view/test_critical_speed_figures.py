@@ -140,7 +140,7 @@ def test_mode_shapes_are_named(swept):
 @pytest.mark.parametrize(("value", "shown"), [(np.nan, "nan"), (0.0, "0")])
 def test_results_without_a_positive_value_are_refused(swept, value, shown):
     empty = swept.assign(critical_speed=swept.critical_speed.copy(data=np.full((25, 3), value)))
-    line = rf"^critical_speed = {shown}: nothing to plot; allowed is a result with a positive value$"
+    line = rf"^critical_speed = {shown}: nothing to plot; expected a result with a positive value$"
     with pytest.raises(InputError, match=line):
         plot(empty)
     with pytest.raises(InputError, match=line):

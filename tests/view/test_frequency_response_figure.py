@@ -67,9 +67,9 @@ def test_results_in_one_figure_differ_only_by_method():
     """The heading shows the parameters once, and each legend entry a different method."""
     first = with_fixed(line(), B1=0.03)
     plot(first, with_fixed(line("exact"), B1=0.03))
-    with pytest.raises(InputError, match=r"B1 = 0\.02: allowed is the value of the first result, 0\.03"):
+    with pytest.raises(InputError, match=r"B1 = 0\.02: expected the value of the first result, 0\.03"):
         plot(first, with_fixed(line("exact"), B1=0.02))
-    with pytest.raises(InputError, match=r"B1 = 0\.02: allowed .* 0\.03"):
+    with pytest.raises(InputError, match=r"B1 = 0\.02: expected .* 0\.03"):
         plot(first, line("exact").assign_coords(B1=0.02))
     with pytest.raises(InputError, match="'multiple scales' is given twice"):
         plot(first, first)
@@ -131,13 +131,13 @@ def test_map_of_two_axes():
 def test_what_cannot_be_drawn_is_refused():
     with pytest.raises(InputError, match="needs u_max and u_min"):
         plot(line().drop_vars("u_min"))
-    with pytest.raises(InputError, match="allowed is omega"):
+    with pytest.raises(InputError, match="expected omega"):
         plot(line().rename(omega="beta"))
-    with pytest.raises(InputError, match=r"axes = omega \(one value\): allowed is omega of several values"):
+    with pytest.raises(InputError, match=r"axes = omega \(one value\): expected omega of several values"):
         plot(line().isel(omega=[3]))
     with pytest.raises(InputError, match="several results"):
         plot(xr.Dataset(attrs={"analysis": "floquet"}), line())
-    with pytest.raises(InputError, match="allowed is the analysis of the first result"):
+    with pytest.raises(InputError, match="expected the analysis of the first result"):
         plot(line(), xr.Dataset(attrs={"analysis": "floquet"}))
 
 

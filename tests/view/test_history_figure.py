@@ -75,9 +75,9 @@ def test_history_without_values_says_so():
 def test_nothing_to_plot_is_an_input_error():
     with pytest.raises(InputError, match="velocity missing; the figure needs phi and velocity"):
         plot(history().drop_vars("velocity"))
-    with pytest.raises(InputError, match="axes = zeta: allowed is one axis of up to 8 values"):
+    with pytest.raises(InputError, match="axes = zeta: expected one axis of up to 8 values"):
         plot(history(zeta=np.linspace(0, 1, 9).tolist()))
-    with pytest.raises(InputError, match="axes = zeta, beta: allowed is one axis"):
+    with pytest.raises(InputError, match="axes = zeta, beta: expected one axis"):
         plot(history(zeta=[0.1, 0.2], beta=[0.1, 0.2]))
 
 

@@ -64,7 +64,7 @@ def test_joints_meet_a_critical_speed_at_half_of_it(capsys):
 def test_no_crossing_in_the_range_is_an_answer_too():
     found = dt.point("planetary", "modes", outputs=["natural_frequency"], operating_max=50.0, **GEAR)
     assert "from 0 to 50 rpm: no order meets a natural frequency" in repr(found)
-    with pytest.raises(dt.InputError, match="operating_max = 0: allowed is a speed of at least operating_min = 10"):
+    with pytest.raises(dt.InputError, match="operating_max = 0: expected a speed of at least operating_min = 10"):
         dt.point("planetary", "modes", operating_min=10.0, **GEAR)
 
 

@@ -124,7 +124,7 @@ def test_without_translations_the_carrier_carries_the_planets():
         (shapes().assign_attrs(fixed_parameters="{}"), "planet_angle"),
         (
             result(2, natural_frequency=np.full((2, 3), np.nan)),
-            "^natural_frequency = nan: nothing to plot; allowed is a result with a positive value$",
+            "^natural_frequency = nan: nothing to plot; expected a result with a positive value$",
         ),
         (result(2, natural_frequency=np.zeros((2, 3))), "^natural_frequency = 0: nothing to plot"),
     ],

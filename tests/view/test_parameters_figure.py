@@ -70,6 +70,6 @@ def test_constants_without_an_axis_are_a_table_of_text(tmp_path):
     rows = list(csv.reader(table(labelled_file, None, ",").splitlines()))
     assert rows[0] == ["name", "value", "units"] and float(rows[1][1]) == 9633.726700903984
     assert rows[3][0] == "frequency of the midshaft, mode 2" and rows[3][2] == "Hz"
-    with pytest.raises(InputError, match=r"axes = beta: allowed is none for a table"):
+    with pytest.raises(InputError, match=r"axes = beta: expected none for a table"):
         constants("beta").to_netcdf(labelled_file, engine="h5netcdf")
         table(labelled_file, None)

@@ -57,7 +57,7 @@ def test_unknown_analysis_is_an_input_error():
     with pytest.raises(InputError, match=r"analysis = 'atlas': is a function; .* its `grid` and `drivetrain plot`"):
         plot(results.forced(Omega=OMEGA).assign_attrs(analysis="atlas"))
     with pytest.raises(
-        InputError, match="analysis = 'anything': has no figure; allowed is one of basins, critical_speeds"
+        InputError, match="analysis = 'anything': has no figure; expected one of basins, critical_speeds"
     ):
         plot(results.forced(Omega=OMEGA).drop_vars("outcome").assign_attrs(analysis="anything"))
 

@@ -111,7 +111,7 @@ def test_curves_show_both_flanks_and_bands_of_the_regimes():
 
 
 def test_a_single_value_of_the_axis_is_said_to_be_one():
-    with pytest.raises(InputError, match=r"axes = omega \(one value\): allowed is one axis of several values"):
+    with pytest.raises(InputError, match=r"axes = omega \(one value\): expected one axis of several values"):
         plot(basin([1, 1, 1, 1]).isel(omega=[0]))
 
 

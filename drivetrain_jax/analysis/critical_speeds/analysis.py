@@ -133,16 +133,16 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
         and options.get("order", 0)
         and any(fixed.get(f"k_{place}_y") is not None for place in ("A", "D", "joint"))
     ):
-        raise InputError(f"outputs: {lacking[0]!r} is not computed for two planes; allowed is order = 0")
+        raise InputError(f"outputs: {lacking[0]!r} is not computed for two planes; expected order = 0")
     if request.method == "krylov_determinant":
         for name in (name for name in _ADDITIONS if name in {p.name for p in system.parameters}):
             if fixed.get(name) != system.parameter(name).default:
                 written = f"fixed.{name} = {fixed[name]}" if name in fixed else name
                 raise InputError(
-                    f"{written}: not in the equations of krylov_determinant; allowed is the method certified"
+                    f"{written}: not in the equations of krylov_determinant; expected the method certified"
                 )
         if 0.0 in np.ravel(fixed.get("rhoA", ())):
-            raise InputError("fixed.rhoA: krylov_determinant needs mass in every segment; allowed is rhoA[i] > 0")
+            raise InputError("fixed.rhoA: krylov_determinant needs mass in every segment; expected rhoA[i] > 0")
     low, high = options["operating_min"], options["operating_max"]
     margins = [name for name in ("separation_margin", "required_margin") if name in request.outputs]
     if high < low or (high == 0 and margins):

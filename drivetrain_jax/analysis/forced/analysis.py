@@ -458,7 +458,7 @@ def _matrices(build: Build, n: int, moving: int, values: Mapping[str, Any]) -> A
     n = model.size or n
     if moving not in (0, len(model.displacements)):
         raise InputError(
-            f"system: its model has {len(model.displacements)} displacements; allowed is {moving}, as it says"
+            f"system: its model has {len(model.displacements)} displacements; expected {moving}, as it says"
         )
     phases = model.period * jnp.array([0.0, 0.25, 0.5])
     return model.period * jax.vmap(lambda t: jax.jacfwd(lambda y: model.linear(t, y))(jnp.zeros(n)))(phases)

@@ -255,7 +255,7 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
     samples, harmonics = (request.options.get(name, 0) for name in ("samples", "harmonics"))
     if 0 < samples <= 2 * harmonics:
         allowed = f"0 (by the harmonics) or at least {2 * harmonics + 1}, which tell {harmonics} harmonics apart"
-        raise InputError(f"options.samples = {samples}: allowed is {allowed}")
+        raise InputError(f"options.samples = {samples}: expected {allowed}")
     branches = closed_form_response.BRANCHES.get(request.method, harmonic_response.BRANCHES)
     folds = exact_response.SPECIAL if request.method == "exact" else closed_form_response.FOLDS
     return (

@@ -311,7 +311,7 @@ def _effort(system: type[System], request: Request, most: float, columns: Mappin
 def _period(build: Callable[..., Any], size: int | None, values: Mapping[str, Any]) -> Array:
     flow = build(values)
     if isinstance(flow, Flow) and size not in (None, flow.size):
-        raise InputError(f"system: its flow has {flow.size} components; allowed is one for each of its state, {size}")
+        raise InputError(f"system: its flow has {flow.size} components; expected one for each of its state, {size}")
     return jnp.asarray(flow.period)
 
 

@@ -150,13 +150,13 @@ def requested_times(request: Request) -> tuple[float, ...]:
     """
     times, stop, num = (request.options[name] for name in ("times", "stop", "num"))
     if times and stop:
-        raise InputError(f"options.stop = {stop:g}: given together with times; allowed is one of the two")
+        raise InputError(f"options.stop = {stop:g}: given together with times; expected one of the two")
     if times and num != NUM.default:
-        raise InputError(f"options.num = {num}: given together with times; allowed is one of the two")
+        raise InputError(f"options.num = {num}: given together with times; expected one of the two")
     if not times and not stop:
-        raise InputError("options.times: missing; allowed is times, or stop and num")
+        raise InputError("options.times: missing; expected times, or stop and num")
     if times and (np.diff(times) <= 0).any():
-        raise InputError("options.times: allowed are rising times")
+        raise InputError("options.times: expected rising times")
     return tuple(times) if times else tuple(np.linspace(0.0, stop, num).tolist())
 
 
