@@ -58,6 +58,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The encoding of a terminal may lack characters of a title.
         stream.reconfigure(errors="backslashreplace")  # pyright: ignore[reportAttributeAccessIssue]
     options = parser().parse_args(arguments)
+    if arguments is None and not (getattr(options, "dask", None) or getattr(options, "workers", None)):
+        # xarray imports an installed dask to recognise its arrays, which takes 0.4 s; no command makes any.
+        sys.modules["dask.array"] = None  # pyright: ignore[reportArgumentType]
     try:
         return options.command(options)
     except (InputError, ChunkError) as error:

@@ -222,8 +222,9 @@ _ARCS_AROUND = _ellipses()
 # Nodes of an atlas from power series along one coordinate: a whole line costs as much as a few solves.
 
 
-# Lines computed together, and divisor of the number of positions along them, so that few kernels serve all panels.
-_LANES, _POSITIONS = 16, 24
+# Lines computed together, and divisors of the number of positions along them, so that few kernels serve all panels: the
+# larger one for up to this number of lines, where more positions take less time than compiling another kernel.
+_LANES, _POSITIONS, _MORE, _FEW_LINES = 16, 24, 144, 256
 # Parts of the span per step of the explicit scheme at 1e-10, with a truncation error of 3e-14 of the propagator. Reduction
 # in parts per decade of looser tolerance (four at most). Parts per step of decay.
 _PARTS, _LEAST, _SPARED, _MOST_SPARED, _DECAY = 0.11, 3e-14, 0.0105, 4, 3.0
@@ -276,7 +277,8 @@ class SeriesNodes:
         Values are NaN on lines along which the series does not converge.
         """
         count, x = len(axes[self.axis]), axes[self.axis]
-        x = np.pad(x, (0, -count % _POSITIONS), mode="edge")
+        lines = math.prod(len(axis) for axis in axes) // count
+        x = np.pad(x, (0, -count % (_MORE if count > _POSITIONS and lines <= _FEW_LINES else _POSITIONS)), mode="edge")
         end = max(x, key=abs)
         columns, steps = self._lines([axis if k != self.axis else np.array([end]) for k, axis in enumerate(axes)])
         parts = np.maximum(np.ceil(self._parts * steps), self._least)

@@ -6,6 +6,7 @@ import io
 import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,8 @@ _PAPER = re.compile(r"[^:]*\b(?:Figs?\.?|Tables?|section) \d[^:]*: |, (?:Figs?\.
 _BELOW = 0.6
 # Distance of two names beside points and of two above points, and the largest shift of a name, in points.
 _SPACING, _MOST_SHIFT = (9.5, 14.5), 24
+# A number in matplotlib's language of formulas, and the characters of its exponent.
+_NUMBER, _RAISED = re.compile(r"\$\\mathdefault\{(.*)\}\$"), str.maketrans("0123456789−", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 # Distance from its point below which a name needs no line to it, in points.
 _NEAR = 5.0
 
@@ -44,6 +47,18 @@ class NotebookFigure(Figure):
         width, height = self.get_size_inches()
         # As large as a figure of pyplot, with full resolution for dense screens.
         return image.getvalue(), {"width": round(width * _NOTEBOOK_DPI), "height": round(height * _NOTEBOOK_DPI)}
+
+
+def plain_labels(format_ticks: Callable[[Any], list[str]], values: Any) -> list[str]:
+    """The labels ``format_ticks(values)``; formulas of numbers become plain text, because parsing them takes long."""
+
+    def plain(label: str) -> str:
+        if not (number := _NUMBER.fullmatch(label)):
+            return label
+        text = number[1].replace(r"\times", "×").replace("-", "−")
+        return re.sub(r"\^\{(.*)\}", lambda power: power[1].translate(_RAISED), text)
+
+    return [plain(label) for label in format_ticks(values)]
 
 
 class Sheet:
@@ -124,6 +139,9 @@ class Sheet:
         around = sum(artist.get_window_extent().height for artist in (title, legend)) / figure.dpi
         figure.set_figheight(len(self.axes) * self._height + self._more + around + _FOOT)
         figure.align_ylabels()
+        for formatter in (axis.get_major_formatter() for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+            if not isinstance(formatter.format_ticks, partial):
+                formatter.format_ticks = partial(plain_labels, formatter.format_ticks)
         for write in self._late:
             write()
         return figure

@@ -637,6 +637,17 @@ def test_looking_at_a_result_loads_no_integrator_and_no_tables(folder):
 
 
 @pytest.mark.full
+def test_a_command_does_not_load_an_installed_dask_for_its_arrays(folder):
+    """xarray would, to recognise them."""
+    import dask.array  # noqa: F401  # pyright: ignore[reportUnusedImport]
+
+    code = "import sys; from drivetrain_jax.cli import main\nmain(); import xarray; xarray.Variable('x', [1.0])\n"
+    code += "print([n for n in sys.modules if n.startswith('dask.array.')])"
+    done = subprocess.run([sys.executable, "-c", code, "list"], check=True, capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.full
 @pytest.mark.parametrize("scene", ["quickstart.toml", "cardan_atlas.toml"])
 def test_a_run_writes_its_file_without_tables(folder, scene):
     """A third of the time of a short run would go into loading these packages."""
