@@ -7,8 +7,6 @@ mass, whatever the other parameters. They are combinations of ``1``, ``x`` and, 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -20,14 +18,6 @@ from drivetrain_jax.systems import Shaft
 _NOTHING = 1e-9
 # Frequency at which the gyroscopic effect exceeds every inertia [rad/s].
 _SLOW = 1e-60
-
-
-class _Held(NamedTuple):
-    """Flags of the nodes at which a motion is held: the deflection, the rotation in front of the joint and behind it."""
-
-    deflection: Array
-    before: Array
-    behind: Array
 
 
 def _in_planes(shaft: Shaft) -> tuple[Shaft, ...]:
@@ -47,16 +37,26 @@ def zero_modes(shaft: Shaft) -> Array:
     """
     if shaft.spin is not None or shaft.k_y is not None:
         return _slow_modes(shaft)
+    shaft = shaft.spread()
+    return _number(_unrestrained(shaft, _motions_at_nodes(shaft)[1], *_springs(shaft)))
+
+
+def _number(columns: Array) -> Array:
+    """Number of the columns that are not used up."""
+    return jnp.sum(jnp.any(columns != 0, axis=0), axis=0)
+
+
+def _springs(shaft: Shaft) -> tuple[Array, Array]:
+    """Flags of the nodes whose deflection springs hold, and of those whose rotation they hold."""
     held = shaft.k > 0
-    turning = jnp.zeros_like(held) if shaft.k_rot is None else shaft.k_rot > 0
-    return _free_motions(shaft, _Held(held, turning, turning))
+    return held, jnp.zeros_like(held) if shaft.k_rot is None else shaft.k_rot > 0
 
 
 def _slow_modes(shaft: Shaft) -> Array:
     """Number of positive inertias of the mechanisms, of both planes together if there are two."""
     lanes, shaft = shaft.lanes, shaft.spread()
-    ends, at_ends = _at_ends(shaft)
-    free, *second = (_unrestrained(plane, at_ends) for plane in _in_planes(shaft))
+    ends, at_ends = _motions_at_nodes(shaft)
+    free, *second = (_unrestrained(plane, at_ends, *_springs(plane)) for plane in _in_planes(shaft))
     turned = shaft if shaft.spin is None else shaft._replace(spin=-shaft.spin)
     mass, backward = (_masses(_slow_inertias(turning), at_ends, ends) for turning in (shaft, turned))
     if second:
@@ -77,52 +77,16 @@ def is_undefined(shaft: Shaft) -> Array:
     if shaft.k_y is not None:
         first, second = (is_undefined(plane) for plane in _in_planes(shaft))
         return first | second
-    massive = shaft.rhoA > 0
+    shaft = shaft.spread()
+    massive, (held, turning) = shaft.rhoA > 0, _springs(shaft)
     none = jnp.zeros_like(massive[:1])
-    deflection = jnp.concatenate([massive, none]) | jnp.concatenate([none, massive]) | (shaft.k > 0)
-    turning = jnp.zeros_like(deflection) if shaft.k_rot is None else shaft.k_rot > 0
+    deflection = jnp.concatenate([massive, none]) | jnp.concatenate([none, massive]) | held
     if shaft.m is not None:
         deflection = deflection | (shaft.m > 0)
     if shaft.inertia is not None:
         turning = turning | (shaft.inertia != 0)
-    weightless = _free_motions(shaft, _Held(deflection, turning, turning)) > 0
+    weightless = _number(_unrestrained(shaft, _motions_at_nodes(shaft)[1], deflection, turning)) > 0
     return weightless if shaft.rhoI is None else weightless | jnp.any(~massive & (shaft.rhoI > 0), axis=0)
-
-
-def _free_motions(shaft: Shaft, held: _Held) -> Array:
-    """Number of motions that cost no energy.
-
-    From left to right the motions (f, theta) without energy form the plane, a line or nothing. A line with f = 0 is a
-    rotation about this section (``turning``), one with theta = 0 a translation (``sliding``). What holds f or theta
-    reduces the plane to such a line, and removes every line but the one that has none of it. A hinge without stiffness
-    frees theta, and a rotation that ends there is a separate mode.
-    """
-    lanes = shaft.lanes
-
-    def hold(flag: Array, dimension: Array, first: Array, other: Array) -> tuple[Array, Array, Array]:
-        moved = flag & ~(first & (dimension == 1))
-        first = jnp.where(moved, dimension == 2, first)
-        return jnp.where(moved, jnp.maximum(dimension - 1, 0), dimension), first, other & ~moved
-
-    def across(state: tuple[Array, Array, Array], node: tuple[_Held, Array | None]) -> Any:
-        (dimension, free_count, sliding), (at, free) = state, node
-        turning = jnp.zeros(lanes, bool)
-        dimension, sliding, turning = hold(at.before, dimension, sliding, turning)
-        if free is not None:
-            free_count = free_count + (free & ((dimension == 2) | turning))
-            dimension = jnp.where(free & ~turning, jnp.minimum(dimension + 1, 2), dimension)
-            turning, sliding = turning | (free & (dimension == 1)), sliding & ~free
-            dimension, sliding, turning = hold(at.behind, dimension, sliding, turning)
-        dimension, _, sliding = hold(at.deflection, dimension, turning, sliding)
-        return (dimension, free_count, sliding), None
-
-    free = None
-    if shaft.k_hinge is not None:
-        edge = jnp.zeros((1, *shaft.k_hinge.shape[1:]), bool)
-        free = jnp.concatenate([edge, shaft.k_hinge == 0, edge])
-    start = jnp.full(lanes, 2), jnp.zeros(lanes, int), jnp.zeros(lanes, bool)
-    (dimension, free_count, _), _ = jax.lax.scan(across, start, (held, free))
-    return free_count + dimension
 
 
 def number_of_modes(shaft: Shaft) -> Array:
@@ -132,28 +96,19 @@ def number_of_modes(shaft: Shaft) -> Array:
         return number_of_modes(forward) + number_of_modes(
             backward._replace(spin=None if shaft.spin is None else -shaft.spin)
         )
-    moving = _moving(shaft)
-    count = jnp.sum(moving.deflection, axis=0) + jnp.sum(moving.before, axis=0) + jnp.sum(moving.behind, axis=0)
+    count = jnp.zeros(shaft.k.shape[1:], int)
+    if shaft.m is not None:
+        count = count + jnp.sum((shaft.m > 0) & jnp.isfinite(shaft.k), axis=0)
+    # A polar inertia alone gives a tilt a frequency of backward whirl.
+    if (inertia := _slow_inertias(shaft).inertia) is not None:
+        turning = inertia > 0 if shaft.inertia is None else (inertia > 0) | (shaft.inertia > 0)
+        if shaft.k_rot is not None:
+            turning = turning & jnp.isfinite(shaft.k_rot)
+        count = count + jnp.sum(turning, axis=0)
+        if shaft.k_hinge is not None:
+            # Both sides of an elastic joint turn.
+            count = count + jnp.sum(turning[1:-1] & jnp.isfinite(shaft.k_hinge), axis=0)
     return jnp.where(jnp.any(shaft.rhoA > 0, axis=0), jnp.inf, count)
-
-
-def _moving(shaft: Shaft) -> _Held:
-    """Flags of the motions of the nodes that have a mass of their own; the whole inertia of a rigid joint is behind it.
-
-    A polar inertia alone gives a tilt a frequency of backward whirl.
-    """
-    none, inertia = jnp.zeros(shaft.k.shape, bool), _slow_inertias(shaft).inertia
-    deflection = none if shaft.m is None else (shaft.m > 0) & jnp.isfinite(shaft.k)
-    if inertia is None:
-        return _Held(deflection, none, none)
-    behind = inertia > 0 if shaft.inertia is None else (inertia > 0) | (shaft.inertia > 0)
-    if shaft.k_rot is not None:
-        behind = behind & jnp.isfinite(shaft.k_rot)
-    if shaft.k_hinge is None:
-        return _Held(deflection, none, behind)
-    edge = jnp.zeros((1, *shaft.k_hinge.shape[1:]), bool)
-    elastic = jnp.concatenate([edge, jnp.isfinite(shaft.k_hinge), edge])
-    return _Held(deflection, behind & elastic, behind)
 
 
 def highest_frequency(shaft: Shaft) -> Array:
@@ -199,8 +154,8 @@ def mechanism_shapes(shaft: Shaft, x: Array) -> Array:
     turns about its centre of mass.
     """
     lanes, shaft = shaft.lanes, shaft.spread()
-    ends, at_ends = _at_ends(shaft)
-    combination = _unrestrained(shaft, at_ends)
+    ends, at_ends = _motions_at_nodes(shaft)
+    combination = _unrestrained(shaft, at_ends, *_springs(shaft))
     mass = _masses(shaft, at_ends, ends)
     columns, found = [], []
     for k in range(combination.shape[1]):
@@ -217,7 +172,7 @@ def mechanism_shapes(shaft: Shaft, x: Array) -> Array:
     return jnp.swapaxes(matmul(_motions(shaft, stations, ends), sorted_columns), 0, 1)
 
 
-def _at_ends(shaft: Shaft) -> tuple[Array, Array]:
+def _motions_at_nodes(shaft: Shaft) -> tuple[Array, Array]:
     """The nodes, over the whole length, and the motions there."""
     ends = jnp.concatenate([jnp.zeros_like(shaft.length[:1]), jnp.cumsum(shaft.length, axis=0)])
     ends = ends / ends[-1]
@@ -233,21 +188,24 @@ def _motions(shaft: Shaft, x: Array, ends: Array) -> Array:
     return jnp.stack(rows, axis=1)
 
 
-def _unrestrained(shaft: Shaft, at_ends: Array) -> Array:
-    """Combinations of the motions that no support and no rotational spring holds, as columns; those used up are 0."""
+def _slopes(shaft: Shaft) -> Array:
+    """The slopes of the motions in the segments over the whole length, shape ``(n, motions, *lanes)``."""
+    one = jnp.ones_like(shaft.length)
+    rows = [0 * one, one]
+    if shaft.k_hinge is not None:
+        number = jnp.arange(shaft.segments).reshape(-1, *(1,) * (one.ndim - 1))
+        rows += [jnp.where((k == 0) & (number > joint), one, 0.0) for joint, k in enumerate(shaft.k_hinge)]
+    return jnp.stack(rows, axis=1)
+
+
+def _unrestrained(shaft: Shaft, at_ends: Array, held: Array, turning: Array) -> Array:
+    """Combinations of the motions ``at_ends``, as columns, with no deflection at the nodes ``held`` and no rotation at the
+    nodes ``turning``; those used up are 0."""
     count, lanes = at_ends.shape[1], at_ends.shape[2:]
     unit = jnp.eye(count).reshape(count, count, *(1,) * len(lanes))
-    used = jnp.any(at_ends != 0, axis=0)
-    columns = unit * jnp.where(used, 1.0, 0.0)
-    for node in range(len(at_ends)):
-        columns = _without(columns, at_ends[node], shaft.k[node] > 0)
-    if shaft.k_rot is not None:
-        # Slopes over the whole length of the shaft are of order one.
-        part = shaft.length / jnp.sum(shaft.length, axis=0)
-        for node, (left, right), span in ((0, (0, 1), 0), (-1, (-2, -1), -1)):
-            slope = (at_ends[right] - at_ends[left]) / part[span]
-            columns = _without(columns, slope, shaft.k_rot[node] > 0)
-    return columns
+    columns = unit * jnp.where(jnp.any(at_ends != 0, axis=0), 1.0, 0.0)
+    rows = jnp.concatenate([at_ends, _slopes(shaft)]), jnp.concatenate([held, turning[:-1] | turning[1:]])
+    return jax.lax.scan(lambda columns, row: (_without(columns, *row), None), columns, rows)[0]
 
 
 def _without(columns: Array, row: Array, held: Array) -> Array:
