@@ -191,7 +191,7 @@ def in_words(variable: xr.Variable) -> xr.Variable:
     encoding = {name: sizes for name, sizes in variable.encoding.items() if name == "preferred_chunks"}
     if variable.chunks is None:
         return xr.Variable(variable.dims, indexing.LazilyIndexedArray(words), attrs, encoding)
-    blocks = variable.data.map_blocks(words.of, dtype=words.dtype)  # pyright: ignore[reportAttributeAccessIssue]
+    blocks = variable.data.map_blocks(words.meanings, dtype=words.dtype)  # pyright: ignore[reportAttributeAccessIssue]
     return xr.Variable(variable.dims, blocks, attrs, encoding)
 
 
@@ -207,10 +207,10 @@ class _Words(BackendArray):
     def __getitem__(self, key: indexing.ExplicitIndexer) -> np.ndarray:
         support = indexing.IndexingSupport.OUTER
         return indexing.explicit_indexing_adapter(
-            key, self.shape, support, lambda part: self.of(self._codes[part].values)
+            key, self.shape, support, lambda part: self.meanings(self._codes[part].values)
         )
 
-    def of(self, codes: np.ndarray) -> np.ndarray:
+    def meanings(self, codes: np.ndarray) -> np.ndarray:
         """The words for these codes."""
         words = np.full(np.shape(codes), "", self.dtype)
         for code, meaning in self._meanings.items():

@@ -203,14 +203,14 @@ def _interpolated(function: Function, lower: np.ndarray, upper: np.ndarray) -> d
     ``error`` is four times the largest one at points between the nodes.
     """
 
-    def at(t: np.ndarray) -> np.ndarray:
+    def in_box(t: np.ndarray) -> np.ndarray:
         return function((lower * (1 - t) + upper * (1 + t)) / 2)
 
     d = len(lower)
-    degrees = [_degree(at, d, k) for k in range(d)]
-    tensor = coefficients(at(tensor_nodes(degrees)), degrees)
+    degrees = [_degree(in_box, d, k) for k in range(d)]
+    tensor = coefficients(in_box(tensor_nodes(degrees)), degrees)
     check = np.vstack([np.random.default_rng(1).uniform(-1, 1, (400, d)), list(product((-1.0, 1.0), repeat=d))])
-    exact = at(check)
+    exact = in_box(check)
     error = 4 * np.max(np.abs(evaluate(tensor, check) - exact)) + 4 * _EPS * np.max(np.abs(exact))
     return {"degrees": degrees, "coefficients": encoded(tensor), "error": float(error)}
 

@@ -103,7 +103,7 @@ def _section(path: Path, number: int, asked: list[str], amplitude: Any) -> dict[
 
         system = find_system(str(attrs.get("system")))
         if "forced" in system.models and system.displacements is not None:
-            limit, compared = Limit.of(system, amplitude), True
+            limit, compared = Limit.from_text(system, amplitude), True
             moved = with_prefixes(convert(_forced_motion(chart))) if analysis == "floquet" else None
     handy = with_prefixes(convert(chart))
     fixed = fixed_table(handy)

@@ -130,7 +130,7 @@ def _about_growth(dataset: xr.Dataset) -> Iterator[str]:
     if radius is None or not periods or not np.isfinite(radius.values).any():
         return
     growth = growth_of(dataset)
-    rates, timed = growth.of(radius).transpose(*radius.dims), growth.label.endswith("[1/s]")
+    rates, timed = growth.from_radius(radius).transpose(*radius.dims), growth.label.endswith("[1/s]")
     place = np.unravel_index(int(np.ma.masked_invalid(rates.values).argmax()), rates.shape)
     rate, factor = float(rates.values[place]), float(radius.values[place]) ** periods
     if rate == 0 or not math.isfinite(rate):

@@ -238,7 +238,7 @@ def point(
         raise InputError(re.sub(r"^(points|fixed|options)\.", "", str(error))) from None
     if sensitivities and "floquet" not in job.scene.system.models:
         raise InputError(f"sensitivities: {system} has no spectral radius; allowed for floquet")
-    limit = None if amplitude is None else Limit.of(job.scene.system, amplitude)
+    limit = None if amplitude is None else Limit.from_text(job.scene.system, amplitude)
     result = _result(job, _compute(job))
     if sensitivities:
         # Local import: a point without sensitivities needs no atlas.

@@ -250,13 +250,13 @@ def _of_data(
             name: value for name, value in data.items() if name not in known
         }
 
-    def at(numbers: Mapping[str, Any]) -> Any:
+    def answer_at(numbers: Mapping[str, Any]) -> Any:
         everything = {**data, **numbers}
         parameters = everything | (shaft.physical.converted(everything) if shaft else {})
         return answer({name: parameters[name] - x for name, x in point.items() if name in parameters}, everything)
 
     names = described(system)
-    slopes = jax.grad(at)({name: float(value) for name, value in data.items() if not names[name].integer})
+    slopes = jax.grad(answer_at)({name: float(value) for name, value in data.items() if not names[name].integer})
     sensitivities = [Sensitivity(n, names[n].units, float(x), float(x) * data[n] / 100) for n, x in slopes.items()]
     return sorted(sensitivities, key=lambda rule: -abs(rule.percent))
 
@@ -335,7 +335,7 @@ class Limit:
     own: str
 
     @classmethod
-    def of(cls, system: type[System], written: Any) -> Limit:
+    def from_text(cls, system: type[System], written: Any) -> Limit:
         """The checked limit; :class:`InputError` for a system without a forced response."""
         if "forced" not in system.models or system.displacements is None:
             raise InputError(
@@ -469,7 +469,7 @@ def forced_at(atlas: Any, amplitude: Any, point: Mapping[str, float], verdict: A
     """The comparison of a stored atlas with a limit at one ``point``, as lines and as data; empty without a limit."""
     if amplitude is None:
         return [], {}
-    limit = Limit.of(atlas.scene.system, amplitude)
+    limit = Limit.from_text(atlas.scene.system, amplitude)
     columns = {name: np.array([value]) for name, value in point.items()}
     verdict = atlas.direct(columns, "verdict")[0] if verdict is None else verdict
     text, data = limit.at_point(atlas.amplitude(columns)[0], int(verdict))
@@ -482,7 +482,7 @@ def forced_over(
     """The comparison with a limit in ``ranges`` of speed: lines for each, and data; no lines without a limit."""
     if amplitude is None:
         return [[] for _ in ranges], {}
-    limit, speed = Limit.of(atlas.scene.system, amplitude), atlas.scene.system.roles["speed"]
+    limit, speed = Limit.from_text(atlas.scene.system, amplitude), atlas.scene.system.roles["speed"]
     compared = [forced_along(atlas, limit, ends, at) for ends in ranges]
     return [[along.text(lambda x: named(speed, x))] for along in compared], {
         "forced": [along.data for along in compared]

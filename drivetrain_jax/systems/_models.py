@@ -389,7 +389,7 @@ class PiecewiseLinearOscillator(eqx.Module):
     of the drive [rad/s].
 
     An ``unbalance`` [m] adds ``unbalance omega^2`` to B1 along a range of frequencies. The equation itself, and all that
-    solves it at one frequency, take :meth:`at`. The number 0.0 stands for none.
+    solves it at one frequency, take :meth:`driven_at`. The number 0.0 stands for none.
 
     ``damps_play`` is false if the damper acts in contact only; exact methods serve both.
     """
@@ -419,7 +419,7 @@ class PiecewiseLinearOscillator(eqx.Module):
         """``B1 + unbalance omega^2`` [m/s^2]."""
         return self.B1 + self.unbalance * omega**2 if self.follows else self.B1
 
-    def at(self, omega: Any) -> PiecewiseLinearOscillator:
+    def driven_at(self, omega: Any) -> PiecewiseLinearOscillator:
         """The oscillator at the frequency ``omega``, its whole amplitude in B1."""
         return replace(self, omega=omega, B1=self.amplitude(omega), unbalance=0.0)
 

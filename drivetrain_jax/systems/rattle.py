@@ -134,7 +134,7 @@ class Rattle(System):
     @serves("history", returns=PiecewiseLinearOscillator)
     def oscillator(self) -> PiecewiseLinearOscillator:
         """The oscillator in units of its mass."""
-        return self.along_frequencies().at(self.omega)
+        return self.along_frequencies().driven_at(self.omega)
 
     @serves("frequency_response", parameters=_MOTION)
     def along_frequencies(self) -> PiecewiseLinearOscillator:

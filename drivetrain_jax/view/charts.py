@@ -250,7 +250,7 @@ class Growth(NamedTuple):
     linear: float
     largest: float
 
-    def of(self, radius: xr.DataArray) -> Any:
+    def from_radius(self, radius: xr.DataArray) -> Any:
         """The growth that a spectral radius means; a radius of 0 is infinite decay."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.log(radius) * self.factor
@@ -509,7 +509,7 @@ def _mapped(part: xr.Dataset, name: str) -> xr.DataArray:
     if not _is_radius(name):
         return valid(part, name)
     growth = growth_of(part)
-    return growth.of(valid(part, name)).assign_attrs(long_name=growth.label, units="1")
+    return growth.from_radius(valid(part, name)).assign_attrs(long_name=growth.label, units="1")
 
 
 def own_dimension(dataset: xr.Dataset, name: str) -> str:
@@ -674,7 +674,11 @@ def _scaled(dataset: xr.Dataset, name: str, values: xr.DataArray) -> tuple[xr.Da
     growth, label = growth_of(dataset), variable_label(dataset[name])
     if not _is_radius(name):
         return values, label
-    return (growth.of(values), growth.label) if growth.label.endswith("[1/s]") else (values - 1, f"{label} minus 1")
+    return (
+        (growth.from_radius(values), growth.label)
+        if growth.label.endswith("[1/s]")
+        else (values - 1, f"{label} minus 1")
+    )
 
 
 def half_play(dataset: xr.Dataset) -> float | None:

@@ -87,8 +87,7 @@ def modes(dataset: xr.Dataset) -> Figure:
 
     A single point without shapes is an interference diagram, if the numbers of teeth are known.
     Curves follow the stored ``branch``, so colours do not change where frequencies cross or veer; without it they follow
-    the order of the frequencies. Zero frequencies are not visible on the logarithmic scale. Raises :class:`InputError` for
-    more than one axis, and if needed variables are not stored or have no value.
+    the order of the frequencies. Zero frequencies are not visible on the logarithmic scale.
     """
     names = charts.sweep_axes(dataset)
     if len(names) > 1 or names == ["point"]:
@@ -137,12 +136,7 @@ def _types_over(dataset: xr.Dataset, name: str) -> Figure:
     moving = np.where(frequency > _NEGLIGIBLE * np.nanmax(frequency), frequency, np.nan)
     order = np.argsort(dataset["branch"].values if "branch" in dataset else frequency, axis=1, kind="stable")
     branches, kinds = (np.take_along_axis(array, order, axis=1) for array in (moving, types))
-    for curve, kind in zip(branches.T, kinds.T, strict=True):
-        points = np.stack([x, curve], axis=-1)
-        # A piece between two points has the colour of its end; snapping to whole pixels would make steps.
-        look = {"colors": [colours[str(k)] for k in kind[1:]], "linewidths": 1.1, "capstyle": "round", "snap": False}
-        if np.isfinite(curve).any():
-            axes.add_collection(LineCollection([*np.stack([points[:-1], points[1:]], axis=1)], **look))
+    _draw_coloured(axes, x, branches, np.vectorize(colours.get)(kinds))
     axes.set(yscale="log", ylim=(0.93 * np.nanmin(moving), 1.07 * np.nanmax(moving)))
     plain_decades(axes, "y")
     labels = [variable_label(dataset["natural_frequency"])]
@@ -156,6 +150,21 @@ def _types_over(dataset: xr.Dataset, name: str) -> Figure:
     sheet.add(*(Line2D([], [], color=colours[kind], label=kind) for kind in shown))
     mixed = "coupled" in _types(dataset) and "coupled" not in types
     return sheet.finish(dataset, "coupled modes in the colour of their dominant family" if mixed else "")
+
+
+def _draw_coloured(axes: Axes, x: np.ndarray, curves: np.ndarray, colours: np.ndarray) -> None:
+    """Draw ``curves`` (points, n) whose pieces have the colour of their end; snapping to whole pixels would make steps."""
+    for curve, look in zip(curves.T, colours.T, strict=True):
+        points = np.stack([x, curve], axis=-1)
+        style: dict[str, Any] = {"colors": look[1:].tolist(), "linewidths": 1.1, "capstyle": "round", "snap": False}
+        if np.isfinite(curve).any():
+            axes.add_collection(LineCollection([*np.stack([points[:-1], points[1:]], axis=1)], **style))
+
+
+def _ends(x: np.ndarray, curves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places of the last finite points of ``curves`` (points, n), and these points (n, 2)."""
+    last = len(x) - 1 - np.isfinite(curves[::-1]).argmax(axis=0)
+    return last, np.stack([x[last], curves[last, np.arange(curves.shape[1])]], axis=-1)
 
 
 def _close(frequency: np.ndarray) -> list[int]:
@@ -271,8 +280,7 @@ def critical_speeds(dataset: xr.Dataset) -> Figure:
 
     Along a logarithmic axis (support stiffness) both axes are logarithmic: the critical-speed map. A list of points is
     drawn along its first parameter. A single point without shapes is an interference diagram. Uncertified frequencies are
-    crossed. Raises :class:`InputError` for more than two axes, and if no variable that can be drawn is stored or has a
-    value.
+    crossed.
     """
     names, orders = charts.sweep_axes(dataset), stored_orders(dataset.attrs)
     if not names and "mode_shape" in dataset:
@@ -303,10 +311,8 @@ def _modes_over(dataset: xr.Dataset, name: str, shown: str) -> Figure:
     axes.set_xlim(x[0], x[-1])
     axes.set(yscale="log") if logarithmic else axes.set_ylim(bottom=0.0)
     kept = np.isfinite(drawn).any(axis=1)
-    last = len(x) - 1 - np.isfinite(drawn[:, ::-1]).argmax(axis=1)
-    ends = np.stack([x[last], drawn[np.arange(len(drawn)), last]], axis=-1)[kept]
     modes = [f"mode {mode}" for mode in dataset["mode"].values[kept]]
-    sheet.later(partial(write_names, axes, ends, modes, colours=colours[kept]))
+    sheet.later(partial(write_names, axes, _ends(x, drawn[kept].T)[1], modes, colours=colours[kept]))
     orders = stored_orders(dataset.attrs) if shown == "critical_speed" else None
     for (label, times), dashes in zip(orders.per_turn.items() if orders else (), _DASHES, strict=False):
         style: dict[str, Any] = {"linestyle": dashes, "linewidth": 1.2 if times == 1 else 0.7}
@@ -450,15 +456,11 @@ def whirl(dataset: xr.Dataset) -> Figure | None:
     y, colours = y[:, kept], np.array(_SENSES)[codes[:, kept]]
     sheet = Sheet(height=4.4)
     axes = sheet.axes[0, 0]
-    for curve, look in zip(y.T, colours.swapaxes(0, 1), strict=True):
-        points = np.stack([x, curve], axis=-1)
-        pieces = [*np.stack([points[:-1], points[1:]], axis=1)]
-        # A piece between two points has the colour of its end.
-        axes.add_collection(LineCollection(pieces, colors=look[1:].tolist(), linewidths=1.1))
+    _draw_coloured(axes, x, y, colours)
     axes.set(xlim=(x[0], x[-1]), ylim=(0, _TOP * np.nanmax(y)))
-    last = len(x) - 1 - np.isfinite(y[::-1]).argmax(axis=0), np.arange(y.shape[1])
-    ends, names = np.stack([x[last[0]], y[last]], axis=-1), [str(mode) for mode in modes]
-    sheet.later(partial(write_names, axes, ends, names, colours=colours[last].tolist()))
+    last, ends = _ends(x, y)
+    look = {"colours": colours[last, np.arange(y.shape[1])].tolist()}
+    sheet.later(partial(write_names, axes, ends, [str(mode) for mode in modes], **look))
     for colour, name in zip(_SENSES, charts.flags(dataset["whirl_direction"]), strict=True):
         sheet.add(*([Line2D([], [], color=colour, label=name)] if colour in colours[1:] else []))
     orders, units = stored_orders(dataset.attrs), str(dataset["whirl_frequency"].attrs["units"])
@@ -488,7 +490,7 @@ def _interference(dataset: xr.Dataset, orders: Orders, colours: Any, kinds: Mapp
     its orders; ``colours`` of its modes, and the ``kinds`` of colours for the legend.
 
     Crossings have their speeds as numbers, of many modes only those with the first order. With an operating range only its
-    surroundings are shown. Raises :class:`InputError` without a positive frequency.
+    surroundings are shown.
     """
     stored = dataset[next(name for name in FREQUENCIES if name in dataset)]
     charts.require_values(stored, positive=True)

@@ -44,8 +44,7 @@ def history(dataset: xr.Dataset) -> Figure:
     """Displacement and rate over time, phase portrait, and for a single history the curve of both over time in space.
 
     Displacement and rate are the first two components of the state. One history has four panels. One axis or ``[points]``
-    has a row of three panels for each of up to eight values. A history without values has empty panels with a note. Raises
-    :class:`InputError` for more axes or values, and unless both components are stored.
+    has a row of three panels for each of up to eight values. A history without values has empty panels with a note.
     """
     names = [str(c["name"]) for c in state(dataset)]
     # Displacements are the first half of the state.
@@ -135,11 +134,7 @@ def thinned(curve: np.ndarray) -> np.ndarray:
 
 
 def section(dataset: xr.Dataset) -> Figure:
-    """The section with all strobes, and with the first 1000 alone if there are more.
-
-    One axis of up to six values gives one row for each value. Raises :class:`InputError` for more axes or values, and
-    unless ``section`` is stored.
-    """
+    """The section with all strobes, and with the first 1000 alone if there are more; a row for each value of an axis."""
     charts.require(dataset, "section", some=True)
     name, parts = _parts(dataset, _SECTIONS)
     columns = 2 if dataset.sizes["strobe"] > _FIRST else 1
@@ -177,10 +172,7 @@ def _draw_section(row: np.ndarray, part: xr.Dataset, name: str) -> None:
 
 
 def steady_state(dataset: xr.Dataset) -> Figure | None:
-    """The motion of a single point, and the basins of the attractors over the initial state; None for other axes.
-
-    Raises :class:`InputError` if variables are missing.
-    """
+    """The motion of a single point, and the basins of the attractors over the initial state; None for other axes."""
     names = charts.sweep_axes(dataset)
     initial = [charts.role(dataset, role) for role in ("initial_displacement", "initial_rate")]
     if not names:
@@ -225,10 +217,7 @@ def _basins(dataset: xr.Dataset, initial: Sequence[str]) -> Figure:
 
 
 def basins(dataset: xr.Dataset) -> Figure:
-    """Largest displacement of every attractor, and the share of its basin with standard error, over the only axis.
-
-    Raises :class:`InputError` for another number of axes, and if ``basin_fraction`` or ``attractor_u_max`` is missing.
-    """
+    """Largest displacement of every attractor, and the share of its basin with standard error, over the only axis."""
     name, *more = charts.sweep_axes(dataset) or ["point"]
     if more or name == "point":
         raise charts.wrong_axes(dataset, "one axis of several values for a figure of basins")

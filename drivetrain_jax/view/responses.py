@@ -69,8 +69,7 @@ def frequency_response(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
 
     Each of ``dataset`` and ``others`` (results for the same parameters by other methods) may have the speed as its single
     axis. Stable motions are solid lines, unstable ones dashed, jumps of a sweep dotted. One dataset with a second axis
-    gives maps of both sweeps. A dataset of forced orbits shows their branches. Raises :class:`InputError` for other axes or
-    parameters, for a method given twice, and if no variable of the figure is stored.
+    gives maps of both sweeps. A dataset of forced orbits shows their branches.
     """
     results = [dataset, *others]
     names, path = charts.sweep_axes(dataset), charts.role(dataset, "speed")
@@ -280,8 +279,7 @@ def _orbits(dataset: xr.Dataset, path: str) -> Figure:
 def harmonic_response(dataset: xr.Dataset) -> Figure:
     """Amplitudes of a single point over the frequency, or the largest of all coordinates over one axis and the frequency.
 
-    A panel holds the coordinates whose names begin alike (``x``, ``u``), a line for each body. Raises :class:`InputError`
-    for more than one axis, and without ``amplitude``.
+    A panel holds the coordinates whose names begin alike (``x``, ``u``), a line for each body.
     """
     charts.require(dataset, "amplitude")
     charts.require_values(dataset["amplitude"], positive=True)

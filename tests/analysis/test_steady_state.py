@@ -239,7 +239,7 @@ def test_an_unstable_orbit_is_no_steady_state():
     start = jnp.array([orbit.real]), jnp.array([-2.0 * orbit.imag])
     count, none = jnp.ones(1, jnp.int32), jnp.zeros(1)
     found = Attractors(*start, count, (none,) * 4, none + 1e-15, count, none, 0 * count)
-    seen = describe(growing.at(jnp.array([2.0])), found, rtol=1e-10)
+    seen = describe(growing.driven_at(jnp.array([2.0])), found, rtol=1e-10)
     assert seen["outcome"] == Outcome.NOT_CONVERGED and np.isnan(seen["spectral_radius"])
 
 

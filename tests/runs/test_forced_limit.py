@@ -16,7 +16,7 @@ from tests.atlases import stored_atlas
 
 DATA = {"J1": 2.0, "J2": 0.5, "k1": 6e4, "k2": 4e4, "c1": 0.3464, "c2": 0.1414, "angle": "12 deg"}
 WORDS = [f"{name}={value}" for name, value in DATA.items()]
-TWO = Limit.of(dt.Cardan, "2 deg")
+TWO = Limit.from_text(dt.Cardan, "2 deg")
 
 
 def test_ranges_within_a_limit_follow_the_resonance_curve():

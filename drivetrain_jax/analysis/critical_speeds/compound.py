@@ -60,7 +60,7 @@ class Scales(NamedTuple):
     r: Array
 
     @classmethod
-    def of(cls, shaft: Shaft, faint: bool = False) -> Scales:
+    def from_shaft(cls, shaft: Shaft, faint: bool = False) -> Scales:
         """The scales of ``shaft``."""
         massless, mean = shaft.rhoA == 0, _mean_mass(shaft.rhoA)
         b = jnp.sqrt(jnp.sqrt(jnp.where(massless, mean, shaft.rhoA) / shaft.EI))
@@ -115,8 +115,8 @@ class LastNode(NamedTuple):
 
 def segments_of(shaft: Shaft, q: Array, faint: bool = False) -> tuple[Segment, LastNode]:
     """The segments, each with the node in front of it, and the last node, at ``q``; for ``faint`` see :class:`Scales`."""
-    scales = Scales.of(shaft)
-    inner = Scales.of(shaft, faint=True) if faint else scales
+    scales = Scales.from_shaft(shaft)
+    inner = Scales.from_shaft(shaft, faint=True) if faint else scales
     shaft = shaft.turning(q * q)
     unit = jnp.concatenate([scales.e3[:1], between(scales.e3), scales.e3[-1:]])
     hinges = turn = None
@@ -267,7 +267,7 @@ class Waves(NamedTuple):
     hyperbolic2: Any
 
     @classmethod
-    def of(cls, s: Any, t: Any) -> Waves:
+    def from_numbers(cls, s: Any, t: Any) -> Waves:
         """From the shear number and the rotary number."""
         half = (s + t) / 2
         # The larger one without cancellation, the other by their product.
@@ -319,7 +319,7 @@ def even_and_odd(square: Array, z: Array) -> tuple[Array, Array, Array]:
 def general(z: Array, r: Array | float, s: Array, t: Array) -> General:
     """The functions of a Timoshenko segment of the phase ``z > 0`` with shear number ``s`` and rotary number ``t``; ``r``
     is 1, or 0 without mass."""
-    waves, massless = Waves.of(s, t), r == 0
+    waves, massless = Waves.from_numbers(s, t), r == 0
     long = jnp.where(massless, 0.0, z)
     ch, sh, growth = even_and_odd(waves.hyperbolic2, long)
     c, sn, _ = even_and_odd(-waves.trigonometric2, long)

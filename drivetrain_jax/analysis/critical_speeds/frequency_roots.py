@@ -83,7 +83,7 @@ class _Brackets(NamedTuple):
 
 def _start(shaft: Shaft, modes: int) -> _Brackets:
     lanes, massive = shaft.lanes, shaft.rhoA > 0
-    total = jnp.sum(jnp.where(massive, Scales.of(shaft).beta, 0.0), axis=0)
+    total = jnp.sum(jnp.where(massive, Scales.from_shaft(shaft).beta, 0.0), axis=0)
     # NaN where rhoA is NaN: such a lane has no bracket.
     total = total + 0.0 * jnp.sum(shaft.rhoA, axis=0)
     index = jnp.arange(1, modes + 1).reshape(modes, *(1,) * len(lanes))
@@ -280,7 +280,7 @@ _APART = 1e-7
 def determinant(shaft: Shaft, q: Array) -> Array:
     """Psi at ``q = sqrt(p)``, over (1 + k_A)(1 + k_D), also in the limit of rigid supports; ``q``: ``(...,
     *lanes)``."""
-    scales = Scales.of(shaft)
+    scales = Scales.from_shaft(shaft)
     (move_A, force_A), (move_D, force_D) = (_shares(k) for k in (shaft.k[0], shaft.k[-1]))
     zero = q * 0 * move_A
     # Columns for theta_A and F_A/k_A, rows f, theta, M, F; with k_A = 0 the second is a displacement without force.
@@ -314,7 +314,7 @@ def krylov_roots(shaft: Shaft, modes: int) -> Roots:
 
     ``certified`` says whether the Wittrick-Williams count gives each its number.
     """
-    total = jnp.sum(Scales.of(shaft).beta, axis=0)
+    total = jnp.sum(Scales.from_shaft(shaft).beta, axis=0)
     span = modes + math.ceil(1.6 * shaft.segments)
     points = POINTS_PER_MODE * span
     lanes = shaft.lanes

@@ -56,9 +56,9 @@ class Segments(NamedTuple):
     massless: Array
 
     @classmethod
-    def of(cls, shaft: Shaft, q: Array) -> Segments:
+    def from_shaft(cls, shaft: Shaft, q: Array) -> Segments:
         """Of the segments of ``shaft`` at ``q = sqrt(p)``."""
-        scales = Scales.of(shaft)
+        scales = Scales.from_shaft(shaft)
         square = (q * scales.b[:, None]) ** 2
         none = jnp.zeros_like(square)
         s = none if shaft.kGA is None else square * (shaft.EI / shaft.kGA)[:, None]
@@ -68,7 +68,7 @@ class Segments(NamedTuple):
         root = jnp.sqrt(half * half + 1)
         ratio = jnp.where(half > 0, half + root, 1 / (root - half))
         size = jnp.sqrt(1 + ratio * ratio)
-        waves = Waves.of(s, t)
+        waves = Waves.from_numbers(s, t)
         z, pair = q * scales.beta[:, None], (waves.trigonometric2, waves.hyperbolic2)
         return cls(z, 1 / size, ratio / size, *pair, s, massless[:, None])
 
@@ -152,7 +152,7 @@ def across_joints(shaft: Shaft, q: Array) -> Links:
     theta`` in front and ``M - kappa theta`` behind it (kappa: that of the rotary inertia there). Each is multiplied by what
     keeps it finite.
     """
-    scales = Scales.of(shaft)
+    scales = Scales.from_shaft(shaft)
 
     def last(x: Array) -> Array:
         return jnp.concatenate([x[:1], x[:-1]])
@@ -248,7 +248,7 @@ def _states(shaft: Shaft, q: Array, size: Array, rank: Array, most: int) -> Arra
     vectors = jnp.take_along_axis(vectors, smallest[None], axis=1)
     x = jnp.moveaxis(vectors.reshape(links - 1, 4, most, lanes), 0, 2)
 
-    dual = matmul(jnp.asarray(_FORM)[:, :, None, None], x) * jnp.repeat(Scales.of(shaft).e3, 2, axis=0)
+    dual = matmul(jnp.asarray(_FORM)[:, :, None, None], x) * jnp.repeat(Scales.from_shaft(shaft).e3, 2, axis=0)
     nothing = jnp.zeros_like(x[:, :, :1])
 
     def in_front(of: Array) -> Array:
@@ -296,8 +296,8 @@ def _conditions(shaft: Shaft, q: Array) -> Links:
 
     At an end, two forms of its state vanish, and two of a state beyond it, which is nothing.
     """
-    scales, q = Scales.of(shaft), q[None]
-    along, across = along_segments(Segments.of(shaft, q)), across_joints(shaft, q)
+    scales, q = Scales.from_shaft(shaft), q[None]
+    along, across = along_segments(Segments.from_shaft(shaft, q)), across_joints(shaft, q)
     none, one = jnp.zeros_like(q), jnp.ones_like(q)
 
     def end(node: int, sign: float) -> tuple[Array, Array]:
@@ -407,7 +407,7 @@ def _end_states(shaft: Shaft, q: Array, waves: Segments) -> tuple[Array, Array]:
     # If parts share a frequency, all is rounding; their states come from the eigenspace.
     moving = moving | ~jnp.any(moving, axis=0)
     logs = ends(log_front + log_d_behind[::-1], log_behind + log_d[::-1])
-    unit = jnp.log(jnp.repeat(Scales.of(shaft).e1, 2, axis=0))[:, None]
+    unit = jnp.log(jnp.repeat(Scales.from_shaft(shaft).e1, 2, axis=0))[:, None]
     place = jnp.argmax(jnp.where(moving, jnp.log(square) + unit + logs, -jnp.inf), axis=0)
     start = jnp.take_along_axis(shared, place[None, None], axis=1)[:, 0]
 
@@ -442,7 +442,7 @@ def mode_shapes(shaft: Shaft, q: Array, x: Array) -> Array:
     ``q`` has shape ``(modes, *lanes)``, the result ``(modes, len(x), *lanes)``. The largest deflection is +1. A mode that
     turns without deflection, as hinged spans with shear and rotary inertia have at their cut-off, is 0 everywhere.
     """
-    waves, b = Segments.of(shaft, q), Scales.of(shaft).b
+    waves, b = Segments.from_shaft(shaft, q), Scales.from_shaft(shaft).b
     front, behind = _end_states(shaft, q, waves)
     lanes = q.shape[1:]
     place = x.reshape(len(x), *(1,) * len(lanes)) * jnp.sum(shaft.length, axis=0)

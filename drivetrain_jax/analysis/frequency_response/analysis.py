@@ -106,7 +106,7 @@ def _solve_branches(
     special = not {"fold_frequency", "doubling_frequency"}.isdisjoint(request.outputs)
     guesses, every, frequencies = _branches_of_orbits(model_at, rising, n, special)
 
-    def at(section: tuple[Array, Array, Array]) -> tuple[Array, ...]:
+    def orbits_at(section: tuple[Array, Array, Array]) -> tuple[Array, ...]:
         value, guess, every = section
         orbits = orbits_near(model_at(value), guess, request.options["rtol"])
         exists = distinct(orbits.orbit.state, SAME)
@@ -122,7 +122,7 @@ def _solve_branches(
         outcome = jnp.where(jnp.any(exists), outcome, Outcome.NOT_CONVERGED)
         return largest, radius, stability, outcome.astype(jnp.int8)
 
-    columns = jax.lax.map(at, (jnp.asarray(rising), guesses, every))
+    columns = jax.lax.map(orbits_at, (jnp.asarray(rising), guesses, every))
     names = ("branch_amplitude", "branch_spectral_radius", "branch_stability", "outcome")
     results = {name: column[place] for name, column in zip(names, columns, strict=True)}
     results |= {name: jnp.broadcast_to(x, (place.size, *x.shape)) for name, x in frequencies.items()}

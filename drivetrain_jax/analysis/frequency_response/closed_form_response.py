@@ -290,13 +290,13 @@ def _everywhere(value: Array) -> Callable[[Array], Array]:
 
 def _of_each(curves_at: Callable[[PiecewiseLinearOscillator], Curves], model: PiecewiseLinearOscillator) -> Curves:
     """Every frequency with its own amplitude of the drive. Peak and folds belong to curves of one amplitude: NaN."""
-    none = jnp.full(jnp.shape(curves_at(model.at(1.0)).peak[0]), jnp.nan)
+    none = jnp.full(jnp.shape(curves_at(model.driven_at(1.0)).peak[0]), jnp.nan)
 
     def along(part: Callable[[Curves], Callable[[Array], Array]]) -> Callable[[Array], Array]:
-        return lambda omega: jax.lax.map(lambda w: part(curves_at(model.at(w)))(w[None])[0], omega)
+        return lambda omega: jax.lax.map(lambda w: part(curves_at(model.driven_at(w)))(w[None])[0], omega)
 
     return Curves(
-        lambda omega: curves_at(model.at(omega)).motions(omega),
+        lambda omega: curves_at(model.driven_at(omega)).motions(omega),
         (none, none),
         none[None],
         along(lambda curves: curves.backbone),

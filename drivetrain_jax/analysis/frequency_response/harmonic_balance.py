@@ -64,7 +64,7 @@ class Basis:
     @cached_property
     def values(self) -> np.ndarray:
         """The basis functions at the samples, (M, n)."""
-        return self.at(2 * np.pi * np.arange(self.count) / self.count)
+        return self.functions_at(2 * np.pi * np.arange(self.count) / self.count)
 
     @cached_property
     def rates(self) -> np.ndarray:
@@ -104,7 +104,7 @@ class Basis:
         angle = np.outer(np.arange(2 * self.highest + 1), 2 * np.pi * np.arange(self.count) / self.count)
         return np.concatenate([np.cos(angle), np.sin(angle)]) / self.count
 
-    def at(self, tau: np.ndarray) -> np.ndarray:
+    def functions_at(self, tau: np.ndarray) -> np.ndarray:
         """The basis functions at ``tau`` (M,), shape (M, n)."""
         angle = np.outer(tau, self.orders)
         even = np.arange(self.size) % 2 == 0

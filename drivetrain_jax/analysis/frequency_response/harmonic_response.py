@@ -134,8 +134,9 @@ def settle(
 ) -> Array:
     """Coefficients of the motion after a transient from the state of ``x`` at tau = 0, in the ``wanted`` lanes."""
     lanes = x.shape[1:]
-    start = jnp.asarray(basis.at(np.zeros(1))[0]), jnp.asarray((basis.at(np.zeros(1)) @ basis.derivative)[0])
-    u, v = jnp.tensordot(start[0], x, 1), jnp.tensordot(start[1], x, 1) * omega / basis.order
+    start = basis.functions_at(np.zeros(1))
+    u, v = (jnp.tensordot(jnp.asarray(row[0]), x, 1) for row in (start, start @ basis.derivative))
+    v = v * omega / basis.order
     # An exactly periodic motion never leaves an unstable orbit: a small offset lets disturbances grow.
     u = u + _PUSH * jnp.sqrt(jnp.sum(x[1:] ** 2, axis=0))
     sampled = Basis(basis.harmonics, basis.order, max(_STEPS[0], 1 << (2 * basis.harmonics).bit_length()))
@@ -407,7 +408,7 @@ def _branches(
     points, units = trace(model, basis, jnp.where(begun.converged, begun.x, jnp.nan), start, stop, scale)
     along, complete = course(points, units), jnp.any(points[:, -1] <= stop, axis=0)
 
-    def at(frequency: Array) -> tuple[Array, Array, Array, Array]:
+    def motions_at(frequency: Array) -> tuple[Array, Array, Array, Array]:
         x, exists, saddle, every = at_frequency(model, basis, along, frequency, BRANCHES)
         wide = jnp.broadcast_to(frequency, lanes)
         motions = jax.lax.map(lambda one: describe(model, basis, one[0], wide, *one[1:]), (x, exists, saddle))
@@ -417,5 +418,5 @@ def _branches(
         )
         return high, low, stability, every & distinct(high, low)
 
-    high, low, stability, every = jax.lax.map(at, jnp.asarray(omega))
+    high, low, stability, every = jax.lax.map(motions_at, jnp.asarray(omega))
     return {"branch_u_max": high, "branch_u_min": low, "branch_stability": stability}, every & complete

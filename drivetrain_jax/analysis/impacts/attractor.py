@@ -358,34 +358,17 @@ def enter(lane: Lane, now: Array, job: Array, place: Array, u: Array, v: Array, 
 
 
 def blank(width: int) -> Lane:
-    """Lanes without a point."""
-    real, whole = jnp.zeros(width), jnp.zeros(width, jnp.int32)
-    pair, flag = (real, real), jnp.zeros(width, bool)
-    motion = Motion(real, real + 1, real, real, real, (real + 1, real, real, real + 1), whole, whole)
-    return Lane(
-        job=whole,
-        place=whole,
-        motion=motion,
-        count=whole,
-        due=whole,
-        latest=pair,
-        tangent=pair,
-        growth=real,
-        cost=whole,
-        spent=real,
-        searching=flag,
-        multiple=whole + 1,
-        corrections=whole,
-        second=whole,
-        guess=pair,
-        first=pair,
-        change=real,
-        approaching=flag,
-        orbit=Orbit(real, real, (real, real, real, real), real, real),
-        begun=whole,
-        held=whole,
-        probing=whole - 1,
+    """Lanes without a point; :func:`enter` replaces all their values but the kinds."""
+    real, whole, flag = jnp.zeros(width), jnp.zeros(width, jnp.int32), jnp.zeros(width, bool)
+    pair, matrix = (real, real), (real, real, real, real)
+    motion, orbit = (
+        Motion(real, real + 1, real, real, real, matrix, whole, whole),
+        Orbit(real, real, matrix, real, real),
     )
+    return Lane(
+        whole, whole, motion, whole, whole, pair, pair, real, whole, real, flag, whole, whole, whole,
+        pair, pair, real, flag, orbit, whole, whole, whole,
+    )  # fmt: skip
 
 
 # Newton: most corrections, relative size of the last correction, and size below which corrections may stall by rounding.

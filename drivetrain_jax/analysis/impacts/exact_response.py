@@ -133,7 +133,7 @@ def periodic_results(oscillator: PiecewiseLinearOscillator, seen: Measures) -> d
 def points_of(model: PiecewiseLinearOscillator, length: int, lanes: int) -> PiecewiseLinearOscillator:
     """The oscillators of all points, frequencies first: fields of shape ``(length * lanes,)``, or scalars."""
     tiled = {name: jnp.tile(x, length) for name, x in vars(model).items() if name != "omega" and jnp.ndim(x)}
-    return replace(model, **tiled).at(jnp.repeat(jnp.asarray(model.omega), lanes))
+    return replace(model, **tiled).driven_at(jnp.repeat(jnp.asarray(model.omega), lanes))
 
 
 def sweeps(
@@ -203,7 +203,7 @@ def _period_map(model: PiecewiseLinearOscillator) -> PeriodMap:
     def mapped(x: Array) -> Mapped:
         omega = jnp.concatenate([x[2], x[2] * (1 + _DIFFERENCE)])
         twice = {name: jnp.tile(value, 2) for name, value in vars(model).items() if name != "omega" and jnp.ndim(value)}
-        lanes = prepare(replace(model, **twice).at(omega))
+        lanes = prepare(replace(model, **twice).driven_at(omega))
         end = march(lanes, start(lanes, jnp.tile(x[0], 2), jnp.tile(x[1], 2), jnp.asarray(1, jnp.int32)), _MOST_STEPS)
         half = x.shape[1]
         state = jnp.stack([end.u, end.v])

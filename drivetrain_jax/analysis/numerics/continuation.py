@@ -281,12 +281,12 @@ def folds_and_doublings(
     column = jnp.broadcast_to(jnp.arange(lanes), place.shape)
     kind = jnp.broadcast_to(jnp.arange(2)[:, None], place.shape)
 
-    def at(shift: int) -> tuple[Array, Array]:
+    def ends_of(shift: int) -> tuple[Array, Array]:
         x = jnp.where(exists[:, :, None], jnp.moveaxis(branch.x[place + shift, :, column], -1, 2), jnp.nan)
         value = jnp.where(exists, tests[kind, place + shift, column], jnp.nan)
         return jnp.moveaxis(x, 2, 0).reshape(branch.x.shape[1], -1), value.reshape(-1)
 
-    (before, first), (after, second) = at(0), at(1)
+    (before, first), (after, second) = ends_of(0), ends_of(1)
     x = locate(map_of(column.reshape(-1)), (before, after), (first, second), kind.reshape(-1) == 1)
     p = x[-1].reshape(place.shape)
     lost = jnp.any(exists & jnp.isnan(p), axis=(0, 1)).reshape(parts, -1).any(axis=0)
@@ -384,14 +384,14 @@ def sections(branch: Course, omega: Array, count: int) -> tuple[Array, Array, Ar
     place = jnp.argmax(changes, axis=1)
     number, second = place // 2, place % 2
 
-    def at(values: Array, shift: int = 0) -> Array:
+    def taken(values: Array, shift: int = 0) -> Array:
         if values.ndim == 2:
             return jnp.take_along_axis(values, number + shift, axis=0)
         return jnp.take_along_axis(values, (number + shift)[:, None], axis=0)
 
-    ends = (at(branch.points), at(branch.points, 1))
-    slopes = tuple(at(slope) for slope in branch.slopes)
-    cut = at(branch.cut)
+    ends = (taken(branch.points), taken(branch.points, 1))
+    slopes = tuple(taken(slope) for slope in branch.slopes)
+    cut = taken(branch.cut)
     low, high = jnp.where(second, cut, 0.0), jnp.where(second, 1.0, cut)
     start = jnp.take_along_axis(branch.nodes, place, axis=0) > omega
 
