@@ -74,9 +74,8 @@ def in_order(*names: str) -> Rule:
     return Rule(" <= ".join(names), names, broken)
 
 
-def relation(text: str, variables: tuple[str, ...], broken: Callable[[xr.Dataset], xr.DataArray]) -> Rule:
-    """A rule given by its text and function."""
-    return Rule(text, variables, broken)
+# A rule given by its text, variables and function.
+relation = Rule
 
 
 def multiple(name: str, factor: float, of: str) -> Rule:

@@ -313,36 +313,22 @@ class _CheckedSolve:
     solve: Callable[[Mapping[str, Any], Array], dict[str, Array]]
 
     def __call__(self, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
-        results: Any = self.solve(values, effort)
-        wanted = (*(self.analysis.variable(name) for name in self.request.outputs), OUTCOME)
-        names = [variable.name for variable in wanted]
-        if not isinstance(results, Mapping):
-            raise self._error(f"solve returned {type(results).__name__}; expected a dict of {', '.join(names)}")
-        declared = [*(variable.name for variable in self.analysis.variables), OUTCOME.name]
-        for name in results:
-            if name not in declared:
-                raise self._error(f"solve returned {name!r}, which is not declared{nearest(str(name), declared)}")
-        for name in names:
-            if name not in results:
-                raise self._error(f"solve returned {', '.join(results)}, not {name}; expected {', '.join(names)}")
-        return {variable.name: self._checked(variable, results[variable.name]) for variable in wanted}
+        results = self.solve(values, effort)
+        wanted = {v.name: v for v in (*(self.analysis.variable(name) for name in self.request.outputs), OUTCOME)}
+        for name in (name for name in wanted if name not in results):
+            solved = f"solve returned {', '.join(results)}, not {name}"
+            raise InputError(f"analysis {self.analysis.name}: {solved}; expected {', '.join(wanted)}")
+        return {name: self._checked(variable, jnp.asarray(results[name])) for name, variable in wanted.items()}
 
-    def _checked(self, variable: Variable, value: Any) -> Array:
+    def _checked(self, variable: Variable, array: Array) -> Array:
         dims = [*(["path"] if self.path else []), *variable.dims]
         sizes = [self.sizes.get(dim, 0) for dim in dims]
-        text = ", ".join([*(f"{dim} = {n}" if n else dim for dim, n in zip(dims, sizes, strict=True)), "lanes"])
-        try:
-            array = jnp.asarray(value)
-        except (TypeError, ValueError):
-            kind = type(value).__name__
-            raise self._error(f"{variable.name} is of type {kind}; expected an array ({text})") from None
         fits = all(size in {0, length} for size, length in zip(sizes, array.shape, strict=False))
         if not fits or array.ndim - len(dims) not in {0, 1}:
-            raise self._error(f"{variable.name} has the shape {array.shape}; expected ({text})")
+            text = ", ".join([*(f"{dim} = {n}" if n else dim for dim, n in zip(dims, sizes, strict=True)), "lanes"])
+            shape = f"{variable.name} has the shape {array.shape}; expected ({text})"
+            raise InputError(f"analysis {self.analysis.name}: {shape}")
         return array
-
-    def _error(self, text: str) -> InputError:
-        return InputError(f"analysis {self.analysis.name}: {text}")
 
 
 def _method_and_options(
