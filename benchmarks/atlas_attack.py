@@ -91,12 +91,7 @@ CASES = (
     Case("zeta=0.1", _CHART, 1e-11, {"zeta": 0.1}),
     Case("alpha=20", _CHART, 1e-11, {"alpha": 20.0}),
     Case("mu=20", _CHART, 1e-11, {"mu": 20.0}),
-    Case(
-        "four",
-        {"beta": (0.0, 1.3), "Omega": (0.2, 2.5), "mu": (0.2, 20.0), "alpha": (0.1, 20.0)},
-        2e-9,
-        rtol=1e-8,
-    ),
+    Case("four", {"beta": (0.0, 1.3), "Omega": (0.2, 2.5), "mu": (0.2, 20.0), "alpha": (0.1, 20.0)}, 2e-9, rtol=1e-8),
 )
 
 

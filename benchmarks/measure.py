@@ -145,9 +145,7 @@ class Study:
         about = f"medians of up to {repeats} runs in turns, as many as {spent:g} s allow ('timed'), without compilation"
         notes = [about, *self.notes(self.quick if quick else self.regions)]
         write_csv(
-            folder / f"precision_{self.system}.csv",
-            list(map(asdict, measure(contenders, repeats, spent))),
-            notes,
+            folder / f"precision_{self.system}.csv", list(map(asdict, measure(contenders, repeats, spent))), notes
         )
 
 

@@ -23,19 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import eigh
 
-from benchmarks.measure import (
-    GOAL,
-    Job,
-    Judged,
-    Method,
-    Study,
-    columns_scene,
-    engine_job,
-    judged,
-    near,
-    outcomes,
-    take,
-)
+from benchmarks.measure import GOAL, Job, Judged, Method, Study, columns_scene, engine_job, judged, near, outcomes, take
 from tests.oracles.planetary_reference import (
     TABLE_2,
     exact_frequencies,

@@ -22,17 +22,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from benchmarks.measure import (
-    Job,
-    Judged,
-    Method,
-    Study,
-    columns_scene,
-    engine_job,
-    judged,
-    once,
-    outcomes,
-)
+from benchmarks.measure import Job, Judged, Method, Study, columns_scene, engine_job, judged, once, outcomes
 from tests.oracles.tripod_reference import NINE_DEGREES, Shaft, shaft
 
 HEYOKA = find_spec("heyoka") is not None

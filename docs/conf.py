@@ -13,13 +13,7 @@ project = "drivetrain_jax"
 author = "the authors of drivetrain_jax"
 version = release = drivetrain_jax.__version__
 
-extensions = [
-    "myst_nb",
-    "sphinx.ext.autodoc",
-    "sphinx.ext.doctest",
-    "sphinx.ext.napoleon",
-    "generated",
-]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.doctest", "sphinx.ext.napoleon", "generated"]
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]
 myst_heading_anchors = 3
 # Notebooks run once and are kept beside the pages; an error in one stops the build.

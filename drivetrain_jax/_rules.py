@@ -243,12 +243,7 @@ BUILT_IN = {
     "phasing": Declared(),
     "harmonic_response": Declared(figure="responses.harmonic_response"),
     "steady_state": Declared(
-        (
-            *MOTION,
-            in_order("u_min", "u_mean", "u_max"),
-            within("impacts", 0.0),
-            within("contact_fraction", 0.0, 1.0),
-        ),
+        (*MOTION, in_order("u_min", "u_mean", "u_max"), within("impacts", 0.0), within("contact_fraction", 0.0, 1.0)),
         # NaN is allowed: a motion that never repeats has no multipliers, a motion at rest has no phase, and a spectral
         # radius that underflows has no exponent.
         gaps=("phase", "spectral_radius", "floquet_multiplier", "lyapunov_exponent", "state_error"),
@@ -320,13 +315,7 @@ BUILT_IN = {
             within("period_multiple", 0.0),
         ),
         # NaN is allowed: an unbounded motion has only exponents, and the history of a run ends where it converged.
-        gaps=(
-            "lyapunov_standard_error",
-            "lyapunov_history",
-            "sum_rule_residual",
-            "paper_estimator",
-            "chaos_k01",
-        ),
+        gaps=("lyapunov_standard_error", "lyapunov_history", "sum_rule_residual", "paper_estimator", "chaos_k01"),
         panels=(
             ("lyapunov_spectrum",),
             ("paper_estimator",),
@@ -367,11 +356,7 @@ BUILT_IN = {
         figure="frequencies.critical_speeds",
     ),
     "whirl": Declared(
-        (
-            ordered("whirl_frequency", "mode"),
-            within("whirl_frequency", 0.0),
-            within("whirl_count_certified", 0.0, 1.0),
-        ),
+        (ordered("whirl_frequency", "mode"), within("whirl_frequency", 0.0), within("whirl_count_certified", 0.0, 1.0)),
         figure="frequencies.whirl",
     ),
 }

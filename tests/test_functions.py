@@ -62,10 +62,7 @@ def replaced(system, name, value):
     return type(system).of(system.values | {name: value})
 
 
-@pytest.mark.parametrize(
-    "case",
-    but_full(CASES, *(CASES.keys() - {"bicardan critical_speeds"})),
-)
+@pytest.mark.parametrize("case", but_full(CASES, *(CASES.keys() - {"bicardan critical_speeds"})))
 def test_a_batch_equals_the_loop_and_the_sweep(case):
     function, system, name, values, rtol = CASES[case]
     batch = jax.vmap(lambda x: replaced(system, name, x))(jnp.asarray(values))
@@ -350,10 +347,7 @@ def test_registered_classes_are_known_by_name(tmp_path, monkeypatch):
         dt.run(scene, out=out)
     assert dt.register(dt.Cardan) is dt.Cardan and not systems._REGISTERED.keys() - {"own"}
     same = type("Same", (made(1.0),), {"name": "cardan"})
-    for wrong, message in (
-        (3, "system = 3: expected a subclass of"),
-        (same, "system = 'cardan': names an installed"),
-    ):
+    for wrong, message in ((3, "system = 3: expected a subclass of"), (same, "system = 'cardan': names an installed")):
         with pytest.raises(dt.InputError, match=message):
             dt.register(wrong)
 

@@ -262,10 +262,7 @@ def _with_centres_held(angles: Sequence[float]) -> np.ndarray:
 def dominant() -> str:
     """Dominant families of coupled modes."""
     rows = []
-    for title, degrees in (
-        ("five planets, one 3 degrees off", (0, 75, 144, 216, 288)),
-        ("three at 0, 77, 201", THREE),
-    ):
+    for title, degrees in (("five planets, one 3 degrees off", (0, 75, 144, 216, 288)), ("three at 0, 77, 201", THREE)):
         found = _shares(degrees)
         for family in ("rotational", "translational"):
             shares = found[family]

@@ -280,12 +280,7 @@ def widest_angle(
 
 
 def speed_windows(
-    atlas: Atlas,
-    system: type[System],
-    at: Mapping[str, float],
-    *,
-    margin: float = 0.0,
-    direct: Direct | None = None,
+    atlas: Atlas, system: type[System], at: Mapping[str, float], *, margin: float = 0.0, direct: Direct | None = None
 ) -> Windows:
     """The stable ranges of the speed with the other parameters ``at``.
 

@@ -27,15 +27,7 @@ from drivetrain_jax.runs.assemble import (
 )
 from drivetrain_jax.runs.job import Job, Results
 from drivetrain_jax.runs.resolve import resolve
-from drivetrain_jax.runs.reuse import (
-    NO_REUSE,
-    NotReusable,
-    ReusableResult,
-    ReusedPoints,
-    combined,
-    differences,
-    find,
-)
+from drivetrain_jax.runs.reuse import NO_REUSE, NotReusable, ReusableResult, ReusedPoints, combined, differences, find
 from drivetrain_jax.runs.scene import load_scene, restore_scene
 from drivetrain_jax.store import checksums, consolidate, zarr_store
 from drivetrain_jax.store.checksums import opened

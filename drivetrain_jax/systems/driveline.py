@@ -25,17 +25,7 @@ from jax.tree_util import Partial
 from drivetrain_jax._errors import counted
 from drivetrain_jax._quantities import Component, Dimension, Variable
 from drivetrain_jax.resonances import DRIVELINE
-from drivetrain_jax.systems._base import (
-    POSITIVE,
-    RPM,
-    Number,
-    PhysicalData,
-    System,
-    Values,
-    numeric,
-    parameter,
-    serves,
-)
+from drivetrain_jax.systems._base import POSITIVE, RPM, Number, PhysicalData, System, Values, numeric, parameter, serves
 from drivetrain_jax.systems._models import (
     Block,
     FloquetModel,

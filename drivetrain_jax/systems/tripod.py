@@ -19,16 +19,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from drivetrain_jax._quantities import Component, Parameter, Variable
-from drivetrain_jax.systems._base import (
-    POSITIVE,
-    Conversion,
-    Number,
-    PhysicalData,
-    System,
-    Values,
-    parameter,
-    serves,
-)
+from drivetrain_jax.systems._base import POSITIVE, Conversion, Number, PhysicalData, System, Values, parameter, serves
 from drivetrain_jax.systems._models import Components, FloquetModel, Flow, LinearPeriodic, Rows, cos, sin
 
 # Default parameters from tables 1, 2 and 4 of the paper, and conflicts between them.

@@ -301,12 +301,7 @@ def colours(field: xr.DataArray, growth: Growth | None = None) -> tuple[dict[str
     return {"cmap": cmap.with_extremes(bad=FAILED_COLOUR), "norm": norm}, bar
 
 
-def chart(
-    dataset: xr.Dataset,
-    panels: Sequence[Sequence[str]] = (),
-    fields: Sequence[str] = (),
-    **look: Any,
-) -> Figure:
+def chart(dataset: xr.Dataset, panels: Sequence[Sequence[str]] = (), fields: Sequence[str] = (), **look: Any) -> Figure:
     """The figure of any result: multipliers, a table or lines of a single point, lines over one axis, maps over two, small
     multiples over more.
 
@@ -555,12 +550,7 @@ def _draw_threshold(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: 
     return entries
 
 
-def stack(
-    dataset: xr.Dataset,
-    along: str,
-    panels: Sequence[Sequence[str]],
-    **look: Any,
-) -> Sheet:
+def stack(dataset: xr.Dataset, along: str, panels: Sequence[Sequence[str]], **look: Any) -> Sheet:
     """A sheet of panels below each other over the axis ``along``, each with the variables of one entry of ``panels``.
 
     Flags (verdict, regime, failed and pending points) are bands behind the lines. ``look`` goes to :func:`draw_lines`.

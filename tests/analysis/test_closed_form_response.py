@@ -12,10 +12,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 
-from drivetrain_jax.analysis.frequency_response import (
-    closed_form_response,
-    describing_function,
-)
+from drivetrain_jax.analysis.frequency_response import closed_form_response, describing_function
 from drivetrain_jax.analysis.frequency_response.describing_function import follow, refined
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
 from tests.quick_jit import quick_jit

@@ -39,12 +39,7 @@ def cardan(rng, count):
     beta = np.where(rng.random(count) < 0.3, rng.choice(ends, count), rng.uniform(-1.57, 1.57, count))
     mu = np.where(rng.random(count) < 0.3, 1.0, size(rng, count, zero=0))
     rest = {name: size(rng, count, centre) for name, centre in (("zeta", 1e-2), ("alpha", 1.0))}
-    return {
-        "beta": beta,
-        "mu": mu,
-        "Omega": size(rng, count, zero=0),
-        "gamma": size(rng, count, zero=0),
-    } | rest
+    return {"beta": beta, "mu": mu, "Omega": size(rng, count, zero=0), "gamma": size(rng, count, zero=0)} | rest
 
 
 def rattle(rng, count, start=False):
@@ -121,10 +116,7 @@ def computed(name, count, seed=0):
     return xr.Dataset(variables, attrs={"analysis": analysis})
 
 
-SOME = {
-    "slow flow": ("u", "v", "amplitude", "phase"),
-    "history": ("u", "v", "acceleration", "event_velocity"),
-}
+SOME = {"slow flow": ("u", "v", "amplitude", "phase"), "history": ("u", "v", "acceleration", "event_velocity")}
 
 
 def assert_sound(found):

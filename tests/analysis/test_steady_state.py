@@ -244,8 +244,7 @@ def test_an_unstable_orbit_is_no_steady_state():
 
 
 @pytest.mark.parametrize(
-    ("omega", "multiple", "high", "low"),
-    [(1.9, 4, 0.93220042, -3.14377962), (1.4, 3, 1.25707643, -4.71151325)],
+    ("omega", "multiple", "high", "low"), [(1.9, 4, 0.93220042, -3.14377962), (1.4, 3, 1.25707643, -4.71151325)]
 )
 def test_far_from_the_origin_the_motion_about_a_flank_is_the_same(steady, omega, multiple, high, low):
     """With the gap's spring in balance the motion is that of a bilinear oscillator about u = b."""

@@ -328,10 +328,7 @@ def test_wrong_run_is_one_line_and_writes_nothing(cli, folder, case):
             "amplitude = 2: not a parameter; did you mean the option --ampl",
         ),
         (("point", "toy", "toy", "a=1", "sensitivities=true"), "did you mean the option --sensitivities?"),
-        (
-            ("plot", "r.nc", "s.nc", "--out", "t.csv"),
-            "out = 't.csv': a table shows one whole result; expected figures",
-        ),
+        (("plot", "r.nc", "s.nc", "--out", "t.csv"), "out = 't.csv': a table shows one whole result; expected figures"),
         (("plot", "r.nc", "--part", "a=1", "--out", "t.txt"), "out = 't.txt': a table shows one whole result"),
         (("point", "toy", "toy", "a=" + "9" * 5000), "a = inf: expected 0 <= a <= 10"),
         (("plot", "nothing.nc", "--out", "f.png"), "does not exist"),
@@ -664,16 +661,7 @@ def test_a_run_writes_its_file_without_tables(folder, scene):
 @pytest.mark.parametrize(
     ("where", "code", "said"),
     full_after(
-        1,
-        [
-            (
-                ">/dev/full",
-                2,
-                "drivetrain: standard output: No space left on device\n",
-            ),
-            (">&-", 0, ""),
-        ],
-        several=True,
+        1, [(">/dev/full", 2, "drivetrain: standard output: No space left on device\n"), (">&-", 0, "")], several=True
     ),
 )
 def test_an_output_that_takes_nothing(where, code, said):

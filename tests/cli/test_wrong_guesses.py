@@ -94,10 +94,7 @@ GUESSES = [
     (POINT.replace("beta=0.3", ""), "beta: missing; expected"),
     (POINT.replace("beta=0.3", "--beta=0.3"), "unrecognized arguments: --beta=0.3"),
     (POINT.replace("beta=0.3", "beta=0.3+0.1j"), "beta = '0.3+0.1j'"),
-    (
-        POINT.replace("Omega=1.4", "Omega=1500rpm"),
-        "rpm is a unit of another quantity; expected a number without unit",
-    ),
+    (POINT.replace("Omega=1.4", "Omega=1500rpm"), "rpm is a unit of another quantity; expected a number without unit"),
     (POINT.replace("Omega=1.4", "speed=1500"), "J1: missing"),
     (POINT.replace("zeta=0.001", "zeta=0.1%%"), "is not a unit"),
     (f"{POINT} beta=0.2", "beta is given twice"),

@@ -258,10 +258,7 @@ def test_axes_of_a_scene_in_physical_data_name_the_results():
 @pytest.mark.parametrize(
     ("grid", "message"),
     [
-        (
-            {"speed": 10},
-            "speed = 10: not a parameter of the atlas; expected 0 <= beta <= 0.6, in rad; 1 <= Omega <= 2",
-        ),
+        ({"speed": 10}, "speed = 10: not a parameter of the atlas; expected 0 <= beta <= 0.6, in rad; 1 <= Omega <= 2"),
         ({"mu": 10}, "mu = 10: the atlas is made for mu = 1; leave it out"),
         ({"beta": 1}, "grid.beta = 1: is a number of values; expected 2 or more; 1.0 would fix beta"),
         ({"Omega": (1.0, 3.0, 5)}, "Omega = 2.5: expected 1 <= Omega <= 2"),

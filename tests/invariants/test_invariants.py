@@ -96,11 +96,7 @@ def test_the_first_wrong_point_is_named(chart):
             "critical_speed = 60/max(|order|, 1) natural_frequency",
         ),
         ("steady_state", {"u_min": real([1.0]), "u_max": real([0.5])}, "u_min <= u_max"),
-        (
-            "steady_state",
-            {"u_min": real([-1.0]), "u_max": real([0.5]), "u_rms": real([1.2])},
-            "u_rms <= max |u|",
-        ),
+        ("steady_state", {"u_min": real([-1.0]), "u_max": real([0.5]), "u_rms": real([1.2])}, "u_rms <= max |u|"),
         ("steady_state", {"contact_fraction": real([[1.5]], "flank")}, "0 <= contact_fraction <= 1"),
         (
             "basins",

@@ -57,10 +57,7 @@ def solves(columns: Mapping[str, Any], rtol: float) -> np.ndarray:
 
 
 def cardan_atlas(
-    ranges: Mapping[str, tuple[float, float]],
-    tolerance: float,
-    fixed: Mapping[str, float] = BASE,
-    rtol: float = 1e-10,
+    ranges: Mapping[str, tuple[float, float]], tolerance: float, fixed: Mapping[str, float] = BASE, rtol: float = 1e-10
 ) -> StabilityAtlas:
     """An atlas of the cardan shaft."""
     fixed = {name: value for name, value in fixed.items() if name not in ranges}

@@ -61,8 +61,7 @@ class Ball:
         high, low = _two_sum(self.high, other.high)
         size = np.abs(self.high) + np.abs(other.high)
         return Ball(
-            *_quick_two_sum(high, low + (self.low + other.low)),
-            (self.radius + other.radius + _UNIT * size) * _OUTWARD,
+            *_quick_two_sum(high, low + (self.low + other.low)), (self.radius + other.radius + _UNIT * size) * _OUTWARD
         )
 
     def __neg__(self) -> Ball:

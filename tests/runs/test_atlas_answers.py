@@ -278,10 +278,7 @@ def test_a_range_of_speeds_without_extent_has_a_widest_angle():
 
 @pytest.mark.parametrize(
     ("rtol", "beta"),
-    [
-        pytest.param(1e-5, 0.894981, marks=pytest.mark.full),
-        pytest.param(1e-4, 0.871812, marks=pytest.mark.full),
-    ],
+    [pytest.param(1e-5, 0.894981, marks=pytest.mark.full), pytest.param(1e-4, 0.871812, marks=pytest.mark.full)],
 )
 def test_an_undecided_range_that_hides_a_change_ends_a_window(rtol, beta):
     atlas = atlas_of((0.0, 1.3), (0.15, 2.0), rtol=rtol)
@@ -348,8 +345,7 @@ def test_stable_intervals_away_from_the_safe_end_are_listed():
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    ("speeds", "kind", "value"),
-    [((1.3, 1.5), "crossing", S21[0]), ((1.415, 1.417), "undecided", 0.1063277628)],
+    ("speeds", "kind", "value"), [((1.3, 1.5), "crossing", S21[0]), ((1.415, 1.417), "undecided", 0.1063277628)]
 )
 def test_an_answer_names_the_kinds_of_its_ends(speeds, kind, value):
     """On a loose atlas the tip of S21 is undecided from .10633 to .10640, in a narrow range of speeds to .11255."""

@@ -359,10 +359,7 @@ def test_a_file_of_other_coordinates_is_refused(stored):
             "Omga = 1.5: not a parameter of the atlas (did you mean Omega?); "
             "expected 0 <= beta <= 0.6, in rad; 1 <= Omega <= 2",
         ),
-        (
-            {"beta": 0.3, "Omega": 1.5, "mu": 1.01},
-            "mu = 1.01: the atlas is made for mu = 1; expected that value",
-        ),
+        ({"beta": 0.3, "Omega": 1.5, "mu": 1.01}, "mu = 1.01: the atlas is made for mu = 1; expected that value"),
     ],
 )
 def test_questions_outside_the_atlas(atlas, given, message):
@@ -529,10 +526,7 @@ def test_a_chart_of_a_stored_atlas(stored):
         ),
         ({"axes": {"beta": {"start": 1.0, "stop": 1.0}}}, "axes.beta.stop = 1.0: expected stop > start = 1.0"),
         ({"axes": {"beta": {"start": 0.0}}}, "axes.beta.stop: missing; expected start and stop"),
-        (
-            {"axes": {}, "points": {"beta": [0.1]}},
-            "points: atlas needs ranges; expected axes with start and stop",
-        ),
+        ({"axes": {}, "points": {"beta": [0.1]}}, "points: atlas needs ranges; expected axes with start and stop"),
     ],
 )
 def test_wrong_ranges(change, message):

@@ -340,15 +340,7 @@ def turned(path, **changes):
 
 @pytest.mark.parametrize(
     "change",
-    full_after(
-        2,
-        [
-            {"a": slice(None, None, -1)},
-            {"a": slice(0, 5)},
-            {"part": slice(None, None, -1)},
-            {"b": 0},
-        ],
-    ),
+    full_after(2, [{"a": slice(None, None, -1)}, {"a": slice(0, 5)}, {"part": slice(None, None, -1)}, {"b": 0}]),
     ids=["mirrored", "cut", "mirrored results", "one value"],
 )
 def test_a_rearranged_copy_is_neither_reused_nor_complete(tmp_path, change):

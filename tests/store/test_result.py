@@ -16,15 +16,7 @@ from drivetrain_jax import InputError
 from drivetrain_jax._machine import machine, physical_memory, usable_cores
 from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.store import files
-from drivetrain_jax.store.consolidate import (
-    Entry,
-    Labelled,
-    ResultFile,
-    attributes,
-    open_result,
-    release,
-    write_result,
-)
+from drivetrain_jax.store.consolidate import Entry, Labelled, ResultFile, attributes, open_result, release, write_result
 
 
 @pytest.fixture

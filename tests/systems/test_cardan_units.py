@@ -23,14 +23,7 @@ def converted(data):
 def test_values():
     found = converted(DATA)
     assert found == pytest.approx(
-        {
-            "beta": math.radians(35),
-            "Omega": 50 * math.pi / 200,
-            "zeta": 3 / 200,
-            "alpha": 0.5,
-            "mu": 0.25,
-            "gamma": 6.0,
-        }
+        {"beta": math.radians(35), "Omega": 50 * math.pi / 200, "zeta": 3 / 200, "alpha": 0.5, "mu": 0.25, "gamma": 6.0}
     )
 
 

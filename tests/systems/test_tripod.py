@@ -158,8 +158,7 @@ def test_exponents_need_a_time_in_seconds():
     fixed = {"beta": 0.3, "Omega": 1.4, "zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
     scene = {"system": "cardan", "analysis": "floquet", "outputs": ["floquet_exponent"], "fixed": fixed}
     with pytest.raises(
-        InputError,
-        match="'floquet_exponent': a rate in 1/s, and the time of cardan has no unit; expected",
+        InputError, match="'floquet_exponent': a rate in 1/s, and the time of cardan has no unit; expected"
     ):
         load_scene(scene)
 

@@ -327,12 +327,7 @@ def general(z: Array, r: Array | float, s: Array, t: Array) -> General:
     real, total = -(s + t), waves.trigonometric2 + waves.hyperbolic2
     g4 = (0.5 * real * sh * sn - (ch * c - unit)) / total**2
     g3 = (ch * sn - sh * c) / (2 * total)
-    direct = (
-        sh * c - g3 * (waves.hyperbolic2 - 3 * waves.trigonometric2),
-        0.5 * sh * sn - 2 * real * g4,
-        g3,
-        g4,
-    )
+    direct = (sh * c - g3 * (waves.hyperbolic2 - 3 * waves.trigonometric2), 0.5 * sh * sn - 2 * real * g4, g3, g4)
     small = massless | (z * z * 2 * (jnp.maximum(s, jnp.abs(t)) + 1) < _SERIES**2)
     summed = _general_series(jnp.where(small, z, 0.0), r, s, t)
     g = tuple(jnp.where(small, unit * a, b) for a, b in zip(summed, direct, strict=True))

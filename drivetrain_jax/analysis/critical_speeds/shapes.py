@@ -124,12 +124,7 @@ def along_segments(w: Segments) -> Links:
         jnp.where(long, unit * falling, ch * alpha_h + sh * beta_h),
         jnp.where(long, rising, (ch * beta_h + w.hyperbolic2 * sh * alpha_h) / size),
     )
-    behind = (
-        alpha,
-        beta / nu,
-        jnp.where(long, falling, unit * alpha_h),
-        unit * jnp.where(long, rising, beta_h / size),
-    )
+    behind = (alpha, beta / nu, jnp.where(long, falling, unit * alpha_h), unit * jnp.where(long, rising, beta_h / size))
     waves = Links(jnp.stack(before, axis=1), jnp.stack(behind, axis=1))
     return jax.tree.map(partial(jnp.where, w.massless[:, None]), _without_mass(w), waves)
 
@@ -225,9 +220,7 @@ def states_in_clusters(shaft: Shaft, q: Array, states: Array) -> Array:
     def own(mode: tuple[Array, ...]) -> Array:
         q, size, rank, known = mode
         return jax.lax.cond(
-            jnp.any(size > 1),
-            lambda: jnp.where(size > 1, _states(fields, q, size, rank, most), known),
-            lambda: known,
+            jnp.any(size > 1), lambda: jnp.where(size > 1, _states(fields, q, size, rank, most), known), lambda: known
         )
 
     known = jnp.moveaxis(states.reshape(*states.shape[:2], modes, -1), 2, 0)

@@ -112,11 +112,7 @@ def invariants(phi: Blocks, error: Array | float = 0.0) -> tuple[Three, Three, T
     second_slope = _less_product(e1, whole, whole, matrix)
     slopes = _norm(second_slope), _norm(_less_product(e2, whole, second_slope, matrix))
     changed = (2 * jnp.sqrt(size) + error) * error
-    changes = (
-        changed,
-        2 * slopes[0] * error + 4 * changed**2,
-        2 * slopes[1] * error + 10 * (z + changed) * changed**2,
-    )
+    changes = (changed, 2 * slopes[0] * error + 4 * changed**2, 2 * slopes[1] * error + 10 * (z + changed) * changed**2)
     return (e1, e2, 2 * (first + second)), (rounding, rounding * z, rounding * z**2), changes  # pyright: ignore[reportReturnType]
 
 

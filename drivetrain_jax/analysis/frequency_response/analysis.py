@@ -34,15 +34,7 @@ from drivetrain_jax.analysis.forced.orbit import REACH, speed_map
 from drivetrain_jax.analysis.frequency_response import closed_form_response, harmonic_response
 from drivetrain_jax.analysis.frequency_response.harmonic_balance import Basis
 from drivetrain_jax.analysis.impacts import exact_response
-from drivetrain_jax.analysis.impacts.motion import (
-    ABSENT,
-    PHASE,
-    REGIME,
-    REGIMES,
-    STABILITY,
-    STABLE,
-    UNSTABLE,
-)
+from drivetrain_jax.analysis.impacts.motion import ABSENT, PHASE, REGIME, REGIMES, STABILITY, STABLE, UNSTABLE
 from drivetrain_jax.analysis.numerics.continuation import course, folds_and_doublings, follow, sections
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.systems import ForcedModel, PiecewiseLinearOscillator, System

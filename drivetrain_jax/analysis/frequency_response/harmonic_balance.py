@@ -125,12 +125,7 @@ class Contact(NamedTuple):
 def _part(theta: Array) -> tuple[Array, ...]:
     """Integrals over ``[0, theta]`` of the cubic interpolation polynomials of the samples -1, 0, 1, 2."""
     t2, t3, t4 = theta**2 / 2, theta**3 / 3, theta**4 / 4
-    return (
-        (-t4 + 3 * t3 - 2 * t2) / 6,
-        (t4 - 2 * t3 - t2 + 2 * theta) / 2,
-        (-t4 + t3 + 2 * t2) / 2,
-        (t4 - t2) / 6,
-    )
+    return ((-t4 + 3 * t3 - 2 * t2) / 6, (t4 - 2 * t3 - t2 + 2 * theta) / 2, (-t4 + t3 + 2 * t2) / 2, (t4 - t2) / 6)
 
 
 def _crossing(d0: Array, d1: Array, rate0: Array, rate1: Array) -> Array:
