@@ -187,7 +187,7 @@ _COMMANDS: dict[str, tuple[str, tuple[Any, ...]]] = {
     "plot": ("draw the figure of a result", (
         _file("files", "FILE.nc", "results; overlaid: methods of one analysis, or a chart and its atlas", nargs="+"),
         _file("--out", "FIGURE", "figure (.png, .pdf, .svg) or table of constants (.txt, .csv)", required=True),
-        _argument("--part", "name=LOW:HIGH", "part of an atlas: ranges, or name=value", nargs="+", default=[]),
+        _argument("--part", "name=LOW:HIGH", "part of an atlas: ranges, or name=value", nargs="+", action="extend", default=[]),
         _argument("--cells", "N", "cells per axis for an atlas (default: 800)", type=int),
         _argument("--units", "rpm,deg", "units of the axes (default: those of the scene)"),
     )),

@@ -23,7 +23,7 @@ from drivetrain_jax.atlas.criteria import has_boundaries
 from drivetrain_jax.atlas.exclusion import Search
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.tips import Tips, find_tips
-from drivetrain_jax.atlas.windows import narrow
+from drivetrain_jax.atlas.windows import narrow, stability_along
 from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, check_same, open_atlas
 from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.store.files import source_digest
@@ -41,7 +41,7 @@ def chart(source: str | Path | xr.Dataset, part: Mapping[str, float | tuple[floa
     has the stability boundaries (``boundary_NAME``, segments separated by NaN, for each value of the further parameters),
     if the system has them. A chart of two parameters has the tips of the tongues as well (``tip_NAME``, their names,
     ``tip_NAME_error``, ``tip_opens``, ``tip_proved``), and boxes that may contain more tips (``undecided_NAME``). Its
-    attribute ``proof`` says how many verdicts are proved.
+    attribute ``proof`` says how many verdicts are proved. A chart of one parameter has its unstable ranges (``unstable_NAME``).
 
     Raises :class:`InputError` for values outside the atlas, :class:`ChunkError` if a direct solve in a gap fails.
     """
@@ -68,6 +68,12 @@ def chart(source: str | Path | xr.Dataset, part: Mapping[str, float | tuple[floa
     if len(shown) > 1 and has_boundaries(atlas.stability.atlas, atlas.scene.system):
         plane, slices = {n: ranges[n] for n in shown[:2]}, {n: axes[n] for n in axes if n not in shown[:2]}
         dataset = dataset.assign_coords(_stored_curves(atlas, fixed, plane, slices))
+    elif has_boundaries(atlas.stability.atlas, atlas.scene.system):
+        (name,) = shown
+        line = stability_along(narrow(atlas.stability.atlas.slice(fixed), {name: ranges[name]}), atlas.scene.system)
+        ends = np.reshape([(i.lower, i.upper) for i in line.intervals if not i.stable], (-1, 2))
+        about = atlas.labels(name) | {"long_name": f"lower and upper end of an unstable range, {name}"}
+        dataset = dataset.assign_coords({f"unstable_{name}": (("unstable_range", "end"), ends, about)})
     for name, (quantity, convert) in atlas.views.items():
         dataset = in_physical_units(dataset, name, quantity, convert)
     return dataset
@@ -124,7 +130,7 @@ def in_physical_units(dataset: xr.Dataset, name: str, quantity: Parameter, conve
 
 def _curves_in_physical_units(dataset: xr.Dataset, name: str, other: str, units: str, convert: Convert) -> xr.Dataset:
     """``dataset`` with the boundaries and tips along ``name`` as values of the physical datum ``other``."""
-    for prefix, suffix in (("boundary_", ""), ("tip_", ""), ("tip_", "_error"), ("undecided_", "")):
+    for prefix, suffix in (("boundary_", ""), ("tip_", ""), ("tip_", "_error"), ("undecided_", ""), ("unstable_", "")):
         if (old := f"{prefix}{name}{suffix}") in dataset.coords:
             values, label = dataset[old], dataset[old].attrs["long_name"].replace(name, other)
             # The conversions are linear.

@@ -8,6 +8,7 @@ import re
 import textwrap
 from collections.abc import Sequence
 from functools import partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import matplotlib
@@ -37,6 +38,7 @@ from drivetrain_jax.view.style import (
     in_brackets,
     power_of_ten,
     ranges_text,
+    runs_text,
     scene_key,
     size,
     suitable,
@@ -567,18 +569,28 @@ def stack(dataset: xr.Dataset, along: str, panels: Sequence[Sequence[str]], **lo
         codes = valid(dataset, name) if (name := _flagged(dataset)) else computed(dataset)
         for (axes,) in sheet.axes if codes.ndim == 1 and codes.any() else ():
             sheet.add(*draw_flags(axes, codes, along))
+        # Those of an atlas, which may be narrower than a cell.
+        exact = dataset[f"unstable_{along}"].values if f"unstable_{along}" in dataset.coords else np.empty((0, 2))
+        for (axes,), (low, high) in product(sheet.axes, exact):
+            k = flags(codes).index("unstable")
+            look = {"color": flag_scale(codes, _PALE)["cmap"].colors[k], "linewidth": 2.0, "zorder": -1.5}
+            span = axes.axvspan(low, high, **look, label="unstable")
+            sheet.add(*(() if (codes == k).any() else (span,)))
         if name and codes.ndim == 1:
             above = 24 if overlays.predictions(dataset, along) else 4
-            sheet.axes[0, 0].set_title(_sentence(codes, dataset[along]), loc="left", pad=above)
+            sheet.axes[0, 0].set_title(_sentence(codes, dataset[along], exact), loc="left", pad=above)
     return sheet
 
 
-def _sentence(codes: xr.DataArray, axis: xr.DataArray) -> str:
-    """The values of ``axis`` at which flags of :func:`valid` other than the most frequent one occur."""
+def _sentence(codes: xr.DataArray, axis: xr.DataArray, exact: np.ndarray) -> str:
+    """The values of ``axis`` at which flags of :func:`valid` other than the most frequent one occur; ``exact`` are the
+    unstable ranges of an atlas."""
     names = [flag.replace("_", " ") for flag in (*flags(codes), FAILED, PENDING)]
     counts = np.bincount(codes.values.astype(int), minlength=len(names))
     most = int(counts.argmax())
-    words = [f"{n} at {ranges_text(axis, codes.values == k)}" for k, n in enumerate(names) if counts[k] and k != most]
+    words = [f"unstable at {runs_text(axis, exact)}"] if len(exact) else []
+    shown = [k for k, n in enumerate(names) if counts[k] and k != most and not (words and n in ("stable", "unstable"))]
+    words += [f"{names[k]} at {ranges_text(axis, codes.values == k)}" for k in shown]
     text = "; ".join(words) or (f"{names[most]} throughout" if counts[most] == codes.size else "")
     return textwrap.fill(f"{text[:1].upper()}{text[1:]}." if text else "", LETTERS)
 
@@ -643,7 +655,10 @@ def draw_lines(
                 ends = [_scaled(dataset, key, known + side * factor * dataset[bound])[0] for side in (-1, 1)]
                 low, high = (end.isel({inner: k}) if inner else end for end in ends)
                 band = {"color": look["color"], "alpha": 0.25, "linewidth": 0, "label": name}
-                sheet.add(axes.fill_between(x, low, high, **band))
+                filled, _ = axes.fill_between(x, low, high, **band), axes.get_ylim()
+                below, above = (axes.transData.transform(np.stack([x, end], axis=-1))[:, 1] for end in (low, high))
+                # A band that nobody sees has no entry.
+                sheet.add(*[filled][: int(np.max(above - below, initial=0.0, where=np.isfinite(above - below)) > 1)])
         if key in _SUMMED:
             sheet.add(*axes.plot(x, values.sum(inner, skipna=False), color=FRAME_GREY, linestyle="--", label="sum"))
         if _is_radius(key) or key.startswith("lyapunov"):

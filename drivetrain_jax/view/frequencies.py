@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MaxNLocator
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range, stored_orders
@@ -62,6 +63,8 @@ _SENSES = ("#16324f", "#9a9a9a", "#d1771e")
 # Height of a Campbell diagram relative to the highest frequency.
 _TOP = 1.05
 _OPERATING: dict[str, Any] = {"color": LINE_COLOURS[1], "alpha": 0.2, "zorder": 0, "label": "operating speeds"}
+# Curves and contours where the separation margin is the required one or less.
+_REQUIRED: dict[str, Any] = {"color": FAILED_COLOUR, "label": "less than the required separation margin"}
 # Height of the shaft's segment of greatest stiffness, in units of the largest deflection; symbols of its points.
 _THICKNESS = 0.3
 _SYMBOLS: dict[str, dict[str, Any]] = {
@@ -323,6 +326,10 @@ def _modes_over(dataset: xr.Dataset, name: str, shown: str) -> Figure:
         # A logarithmic axis has no zero.
         low = operating[0] or min(axes.get_ylim()[0], operating[1] / 10)
         sheet.add(axes.axhspan(low, operating[1], **_OPERATING))
+    if {"separation_margin", "required_margin"} <= set(dataset):
+        near = (dataset["separation_margin"] < dataset["required_margin"]).transpose("mode", name).values & (drawn > 0)
+        lines = axes.plot(x, np.where(near, drawn, np.nan).T, linewidth=5.0, alpha=0.25, zorder=1, **_REQUIRED)
+        sheet.add(*lines[: int(near.any())])
     if logarithmic:
         plain_decades(axes, "y")
     axes.grid(color=FRAME_GREY, alpha=0.2, linewidth=0.5)
@@ -356,17 +363,31 @@ def _maps(dataset: xr.Dataset, names: list[str], shown: str) -> Figure:
     for (axes,), (_, (part,)) in zip(sheet.axes, rows, strict=True):
         field = part[shown].transpose(*reversed(names))
         x, y, low, high = field[names[0]], field[names[1]], float(field.min()), float(field.max())
-        if min(field.shape) > 1 and low < high:
-            lines = axes.contour(x, y, field, _CONTOURS, colors="white", linewidths=0.5)
-            axes.clabel(lines, fontsize=6.5, fmt="%g")
-        per_turn = orders.per_turn if orders else {"": 1.0}
+        per_turn, drawn = orders.per_turn if orders else {"": 1.0}, []
         for (order, times), colour in zip(per_turn.items(), _ORDER_COLOURS, strict=False):
             limits = zip(("lowest", "highest"), _operating(part, shown) or (), ("dashed", "solid"), strict=False)
             for name, speed, dashes in limits:
                 if low < times * speed < high:
-                    axes.contour(x, y, field, [times * speed], colors=colour, linestyles=dashes).set(**style)
+                    drawn.append(times * speed)
+                    axes.contour(x, y, field, drawn[-1:], colors=colour, linestyles=dashes, zorder=3).set(**style)
                     label = f"{name} operating speed" + ("" if times == 1 else f", {order}")
                     sheet.add(Line2D([], [], color=colour, linestyle=dashes, label=label, **style))
+        if min(field.shape) > 1 and low < high:
+            if bool(field.notnull().all()):
+                # Smooth shading in place of cells.
+                (cells,) = axes.collections[:1]
+                axes.pcolormesh(x, y, field, shading="gouraud", cmap=cells.cmap, norm=cells.norm, rasterized=True)
+                axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
+            levels = [level for level in MaxNLocator(_CONTOURS).tick_values(low, high) if level not in drawn]
+            lines = axes.contour(x, y, field, levels, colors="white", linewidths=0.5)
+            axes.clabel(lines, fontsize=6.5, fmt="%g")
+            if {"separation_margin", "required_margin"} <= set(part):
+                gap = (part["separation_margin"] - part["required_margin"]).transpose(*reversed(names))
+                look: dict[str, Any] = {"colors": "none", "hatches": ["///"], "zorder": 2}
+                axes.contourf(x, y, gap, [-np.inf, 0.0], **look).set(edgecolor=FAILED_COLOUR, linewidth=0.0)
+                entry = Rectangle((0, 0), 1, 1, fill=False, hatch="///", edgecolor=FAILED_COLOUR, linewidth=0.0)
+                entry.set_label(_REQUIRED["label"])
+                sheet.add(*[entry][: int((gap < 0).any())])
     return sheet.finish(dataset)
 
 

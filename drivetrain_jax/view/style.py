@@ -190,7 +190,11 @@ def coordinate_text(coordinate: xr.DataArray) -> str:
 def ranges_text(axis: xr.DataArray, holds: np.ndarray) -> str:
     """The runs of sampled values of ``axis`` at which ``holds`` is true: ``speed = 1425, 2275 to 2290 rpm``."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], holds.astype(np.int8), [0]))))
-    runs = [(axis.values[a], axis.values[b - 1]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return runs_text(axis, [(axis.values[a], axis.values[b - 1]) for a, b in zip(edges[::2], edges[1::2], strict=True)])
+
+
+def runs_text(axis: xr.DataArray, runs: Sequence[Sequence[float]]) -> str:
+    """Ranges of ``axis`` as text, the first ones of many."""
     shown = [f"{a:.6g}" if a == b else f"{a:.6g} to {b:.6g}" for a, b in runs[:MOST_RANGES]]
     more = f" and {len(runs) - MOST_RANGES} more ranges" if len(runs) > MOST_RANGES else ""
     units = units_of(axis)

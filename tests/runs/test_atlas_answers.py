@@ -148,12 +148,18 @@ def test_answers_begin_with_one_sentence_in_the_units_of_the_question():
 @pytest.mark.full
 def test_the_damping_of_a_sentence_is_sufficient():
     axes = {"speed": {"start": "2000 rpm", "stop": "4000 rpm"}, "zeta": {"start": 0.0, "stop": 0.01}}
-    atlas = stored_atlas({"system": "cardan", "analysis": "atlas", "axes": axes, "fixed": TRUCK})
+    file = atlas_file({"system": "cardan", "analysis": "atlas", "axes": axes, "fixed": TRUCK})
+    atlas = dt.open_atlas(file)
     assert atlas_answers.speed_windows(atlas, {"c1": 0.3}).answer == (
         "Unstable at speed = 2270.71 to 2288.98 rpm (sum combination C+1) and 3126.26 to 3142.12 rpm (subharmonic S21); "
         "c1 = 2.53436 N m s/rad (zeta = 0.00365803) or more removes this."
     )
     assert atlas_answers.speed_windows(atlas, {"c1": 2.53436}).answer == "Stable at speed = 2000 to 4000 rpm."
+    # A chart along the speed has the same ranges, in its units.
+    ranges = chart(file, {"c1": 0.3}, 9).unstable_speed
+    said = atlas_answers.speed_windows(atlas, {"c1": 0.3}).data["unstable"]
+    np.testing.assert_allclose(ranges, [entry["physical"]["speed"]["value"] for entry in said], rtol=1e-12)
+    assert ranges.units == "rpm" and len(ranges)
     least = atlas_answers.least_damping(atlas, {"speed": (2000.0, 4000.0)})
     assert least.answer.startswith(
         "With c1 = 2.53436 N m s/rad (zeta = 0.00365803) or more, speed = 2000 to 4000 rpm is"

@@ -110,9 +110,32 @@ def test_maps_show_where_a_mode_meets_the_operating_speeds():
     # The joints bend the shaft twice a turn: at 10 rpm they meet the first mode where it is 20 rpm.
     limits = json.dumps({"operating_min": 0.0, "operating_max": 10.0})
     figure = plot(dataset.assign_attrs(options=limits, system="bicardan"))
-    (_, lines) = [each for each in figure.axes[0].collections if isinstance(each, QuadContourSet)]
+    (lines, _) = [each for each in figure.axes[0].collections if isinstance(each, QuadContourSet)]
     np.testing.assert_allclose(np.concatenate(lines.allsegs[0]).sum(axis=1), 10.0)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["highest operating speed, order 2 (joints)"]
+
+
+def test_a_margin_below_the_required_one_is_marked(swept):
+    """Mode 1 misses the margin at its three last points."""
+    gap = np.full((25, 3), 0.5)
+    gap[-3:, 0] = 0.1
+    margins = {
+        "separation_margin": (("k_D", "mode"), gap),
+        "required_margin": (("k_D", "mode"), np.full((25, 3), 0.26)),
+    }
+    figure, told = plot(swept.assign(margins)), "less than the required separation margin"
+    (marked,) = [
+        line for line in figure.axes[0].get_lines() if line.get_linewidth() == 5 and np.isfinite(line.get_ydata()).any()
+    ]
+    assert np.flatnonzero(np.isfinite(marked.get_ydata())).tolist() == [22, 23, 24]
+    assert told in [text.get_text() for text in figure.legends[0].get_texts()]
+    both = xr.concat([swept.assign(margins)] * 3, xr.DataArray([1.0, 2.0, 3.0], dims="k_A", name="k_A")).transpose(
+        "k_A", ...
+    )
+    both = both.assign(outcome=(("k_A", "k_D"), np.zeros((3, 25), "int8"))).drop_vars("count_certified")
+    figure = plot(both)
+    hatched = [c for axes in figure.axes for c in axes.collections if isinstance(c, QuadContourSet) and any(c.hatches)]
+    assert told in [text.get_text() for text in figure.legends[0].get_texts()] and len(hatched) == 3
 
 
 def test_joints_meet_the_modes_at_half_of_their_critical_speeds(swept):

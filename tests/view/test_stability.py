@@ -56,6 +56,11 @@ def test_a_figure_over_one_axis_begins_with_its_ranges():
     assert above(10) == f"Unstable at Omega = {inside[0]:.6g} to {inside[-1]:.6g}."
     assert above(0) == "Undecided at Omega = 0.5 to 0.525."
     assert above(2) == "Stable throughout." and above(1) == "Failed at Omega = 0.5."
+    # An atlas knows its ranges, which may be narrower than a cell.
+    narrow = xr.Variable(("unstable_range", "end"), [[0.7001, 0.7002]])
+    figure = plot(results.chart().isel(beta=2).assign_coords(unstable_Omega=narrow))
+    assert figure.axes[0].get_title(loc="left") == "Unstable at Omega = 0.7001 to 0.7002."
+    assert "unstable" in [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def test_growth_map_shows_the_logarithm_and_masks_failed_cells():
