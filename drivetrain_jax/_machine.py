@@ -5,9 +5,13 @@ from __future__ import annotations
 import os
 import platform
 import sys
+import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 
 @lru_cache
@@ -82,3 +86,69 @@ def in_double_precision() -> None:
 if hasattr(os, "register_at_fork"):
     # A forked child has no threads.
     os.register_at_fork(after_in_child=threads.cache_clear)
+
+
+def notebook() -> Any:
+    """The display functions of IPython in the kernel of a notebook, else None; a terminal of IPython has no kernel."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return import_module("IPython.display") if getattr(shell, "kernel", None) is not None else None
+
+
+def terminal() -> bool:
+    """True if standard error is a terminal that can rewrite a line."""
+    return bool(sys.stderr and sys.stderr.isatty()) and os.environ.get("TERM") != "dumb"
+
+
+class CompilingLine:
+    """Context in which a terminal or a notebook says that this process compiles, and for how long, after ``patience`` [s].
+
+    Contexts of several threads share the line, which the end of the last one removes. A pipe gets nothing, nor does a
+    terminal while the line is ``hidden``, as beside the progress bar of a command.
+    """
+
+    def __init__(self, patience: float = 2.0) -> None:
+        self.hidden, self.patience = False, patience
+        self._lock, self._users, self._begin = threading.Lock(), 0, 0.0
+        self._timer: threading.Timer | None = None
+        self._shown: Any = None
+
+    def __enter__(self) -> None:
+        with self._lock:
+            self._users += 1
+            if self._users == 1 and not self.hidden and (terminal() or notebook()):
+                self._begin = time.monotonic()
+                self._show_after(self.patience)
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._users -= 1
+            if self._users == 0 and self._timer is not None:
+                self._timer.cancel()
+                self._timer = None
+                if self._shown:
+                    self._shown = self._write("") and None
+
+    def _show_after(self, seconds: float) -> None:
+        self._timer = threading.Timer(seconds, self._show)
+        self._timer.daemon = True
+        self._timer.start()
+
+    def _show(self) -> None:
+        with self._lock:
+            # None if the compilation has just ended.
+            if self._timer is not None:
+                self._shown = self._write(f"compiling, {time.monotonic() - self._begin:.0f} s")
+                self._show_after(1.0)
+
+    def _write(self, text: str) -> Any:
+        """Replace the line by ``text``; returns what shows it."""
+        if not (shell := notebook()):
+            print(f"\r{text}\x1b[K", end="", file=sys.stderr, flush=True)
+        elif not self._shown:
+            return shell.display(shell.HTML(text), display_id=True)
+        else:
+            self._shown.update(shell.HTML(text))
+        return self._shown or True
+
+
+compiling = CompilingLine()

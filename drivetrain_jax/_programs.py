@@ -25,7 +25,7 @@ import numpy as np
 from jax.experimental import serialize_executable
 
 import drivetrain_jax
-from drivetrain_jax._machine import instruction_set
+from drivetrain_jax._machine import compiling, instruction_set
 from drivetrain_jax.analysis import Analysis, get_analysis
 from drivetrain_jax.store.files import digest, source_digest, versions, write_atomic
 from drivetrain_jax.systems import System
@@ -208,7 +208,8 @@ def compiled(
     named = lambda *arguments: function(*arguments)  # noqa: E731
     # A new name for what is stored: JAX's own cache returns kernels that cannot be stored again (jax 0.10.2).
     named.__name__ = f"kernel_{secrets.token_hex(8)}"
-    kernel = jax.jit(named if name else function).lower(*kinds).compile(dict(options))
+    with compiling:
+        kernel = jax.jit(named if name else function).lower(*kinds).compile(dict(options))
     # A call of Python code cannot be stored.
     if name and not (calls(kernel, "xla_ffi_python") or calls(kernel, "xla_python")):
         with suppress(*_UNUSABLE):

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from drivetrain_jax import __version__, _units
 from drivetrain_jax._errors import ChunkError, InputError
+from drivetrain_jax._machine import compiling, terminal
 
 if TYPE_CHECKING:
     from drivetrain_jax.runs.run import Progress
@@ -574,7 +575,7 @@ def progress_line() -> Iterator[Callable[[Progress], None]]:
     columns = BarColumn(), TextColumn("{task.fields[counts]}"), TimeElapsedColumn(), TextColumn("left")
     bar = Bar(*columns, TimeRemainingColumn(), console=Console(stderr=True))
     task = bar.add_task("", total=None, counts="compiling")
-    begin = time.monotonic()
+    begin, compiling.hidden = time.monotonic(), True
 
     def report(progress: Progress) -> None:
         # Started at the first report, because wrong input must print a single line.
@@ -592,6 +593,7 @@ def progress_line() -> Iterator[Callable[[Progress], None]]:
         bar.live.stop()
         raise
     finally:
+        compiling.hidden = False
         if bar.live.is_started:
             bar.stop()
 
@@ -599,8 +601,7 @@ def progress_line() -> Iterator[Callable[[Progress], None]]:
 @contextmanager
 def _reading(first: Path, *more: Path) -> Iterator[None]:
     """Show on a terminal that the command works on these files, and remove the line at the end."""
-    terminal = sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
-    write = partial(print, end="", file=sys.stderr, flush=True) if terminal else lambda _: None
+    write = partial(print, end="", file=sys.stderr, flush=True) if terminal() else lambda _: None
     write(f"{first.name}{f' and {len(more)} more' if more else ''} ...\r")
     try:
         yield

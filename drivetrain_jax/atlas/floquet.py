@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._machine import threads, usable_cores
+from drivetrain_jax._machine import compiling, threads, usable_cores
 from drivetrain_jax.analysis.floquet.effort import stable_steps, steps_needed
 from drivetrain_jax.analysis.numerics.collocation import propagators_along
 from drivetrain_jax.analysis.numerics.kernels import Words, compiler_options, predicted, split
@@ -345,6 +345,9 @@ def _kernel(key: Key, positions: int) -> Future[Any]:
     def compiled() -> Any:
         columns, numbers = {name: array(_LANES) for name in names}, {name: array(*shape) for name, shape in fixed}
         arguments = columns, numbers, array(), jax.ShapeDtypeStruct((), np.int64), array(positions)
-        return jax.jit(lines, compiler_options=compiler_options(_LANES, short_loops=True)).lower(*arguments).compile()
+        with compiling:
+            return (
+                jax.jit(lines, compiler_options=compiler_options(_LANES, short_loops=True)).lower(*arguments).compile()
+            )
 
     return threads(2, "series").submit(compiled)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
-from drivetrain_jax._machine import physical_memory
+from drivetrain_jax._machine import notebook, physical_memory
 from drivetrain_jax.runs.assemble import ZarrBlocks
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.output import HDF5, ZARR, Output
@@ -200,9 +198,7 @@ _PATIENCE, _STEP = 0.5, 0.2
 @contextmanager
 def shown_progress(report: Report | None) -> Iterator[Report | None]:
     """Yield ``report``; if it is None in a notebook, yield a report that shows a bar in the running cell."""
-    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-    # A terminal of IPython has no kernel.
-    if report is not None or getattr(shell, "kernel", None) is None:
+    if report is not None or notebook() is None:
         yield report
         return
     bar = _Bar()
@@ -227,7 +223,7 @@ class _Bar:
 
     def show(self) -> None:
         """Show the last state."""
-        shell: Any = import_module("IPython.display")
+        shell = notebook()
         progress, now = self._last, time.monotonic()
         self._due, done = now + _STEP, progress.computed + progress.reused
         # The cost grows evenly in time; points are counted if it is unknown.

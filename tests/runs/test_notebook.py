@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import re
 import sys
+import time
+from contextlib import contextmanager
 from types import ModuleType, SimpleNamespace
 
+import numpy as np
 import pytest
 
 import drivetrain_jax as dt
+from drivetrain_jax import _programs
+from drivetrain_jax._machine import CompilingLine
 from drivetrain_jax.runs import run
 
 
@@ -54,3 +60,36 @@ def test_a_short_run_shows_none(shown, grid_scene, monkeypatch):
     monkeypatch.setattr(run, "_PATIENCE", 100.0)
     dt.run(grid_scene)
     assert not shown
+
+
+def compile_slowly(line, seconds=0.2):
+    with line, line:
+        time.sleep(seconds)
+
+
+def test_a_notebook_says_that_it_compiles(shown):
+    compile_slowly(CompilingLine(0.02))
+    assert shown == ["compiling, 0 s", ""]
+
+
+@pytest.mark.parametrize(
+    ("terminal", "hidden", "text"),
+    [(True, False, "\rcompiling, 0 s\x1b[K\r\x1b[K"), (True, True, ""), (False, False, "")],
+)
+def test_a_terminal_says_that_it_compiles_and_a_pipe_does_not(terminal, hidden, text, monkeypatch):
+    written = io.StringIO()
+    written.isatty = lambda: terminal
+    monkeypatch.setattr(sys, "stderr", written)
+    monkeypatch.setenv("TERM", "xterm")
+    line = CompilingLine(0.02)
+    compile_slowly(line, 0.0)
+    line.hidden = hidden
+    compile_slowly(line)
+    assert written.getvalue() == text
+
+
+def test_programs_are_compiled_under_this_line(monkeypatch):
+    entered = []
+    monkeypatch.setattr(_programs, "compiling", contextmanager(lambda: (yield entered.append(1)))())
+    _programs.compiled(lambda x: x, (np.float64(0.0),), {}, "")
+    assert entered == [1]
