@@ -13,9 +13,10 @@ import msgspec
 import numpy as np
 
 from drivetrain_jax import _units
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, shown
 from drivetrain_jax._quantities import Parameter
 from drivetrain_jax.analysis._base import checked
+from drivetrain_jax.runs import toml
 
 if TYPE_CHECKING:
     from drivetrain_jax.runs.scene import Problem, Value
@@ -78,15 +79,23 @@ class Axis:
         return label if self.entry is None else f"{label}, entry {self.entry}"
 
 
-def in_units(table: AxisTable, parameter: Parameter, where: str, *, keep: bool) -> tuple[AxisTable, Parameter]:
-    """The checked keys of an axis with numbers for texts such as ``"200 rpm"``, and the parameter in their unit.
+def axis_table(parameter: Parameter, name: str, keys: Any, where: str, *, keep: bool) -> tuple[AxisTable, Parameter]:
+    """The checked ``keys`` of an axis with numbers for texts such as ``"200 rpm"``, and the parameter in their unit.
 
-    That is its own unit or, with ``keep``, the unit of the first text. Raises :class:`InputError` for a number that is out
-    of range, and for a text that is none.
+    That is its own unit or, with ``keep``, the unit of the first text. Raises :class:`InputError` for keys that are neither
+    a table nor a row of values, and for a number that is out of range.
     """
+    if not isinstance(keys, (Mapping, list)):
+        allowed = "expected a table { start, stop, num } or { values }, or a row of values"
+        raise InputError(f"{where}.{name} = {shown(keys)}: {allowed}")
+    keys = {"values": keys} if isinstance(keys, list) else dict(keys)
+    if isinstance(num := keys.get("num"), float) and num.is_integer():
+        # Options and parameters also accept 1e3 for 1000.
+        keys["num"] = int(num)
+    table = toml.converted(keys, AxisTable, f"{where}.{name}.")
     numbers = [*(end for end in (table.start, table.stop) if end is not None), *(table.values or ())]
     for value in numbers:
-        checked(parameter, value, where)
+        checked(parameter, value, f"{where}.")
     texts = [value for value in numbers if isinstance(value, str)]
     split = _units.split(texts[0]) if keep and texts else None
     described = in_unit(parameter, split[1]) if split else parameter
@@ -118,12 +127,11 @@ def entry_of(name: str) -> tuple[str, int | None]:
     return (match.group(1), int(match.group(2))) if match else (name, None)
 
 
-def check_count(name: str, table: AxisTable, continuous: bool) -> int:
+def check_count(field: str, table: AxisTable, continuous: bool) -> int:
     """Number of values of an axis, before they are computed; raises for incomplete or contradictory keys.
 
     A ``continuous`` axis has two values, its ends.
     """
-    field = f"axes.{name}"
     keys = [key for key in table.__struct_fields__ if getattr(table, key) is not None]
     if continuous and (extra := [key for key in keys if key not in ("start", "stop")]):
         value = getattr(table, extra[0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,11 +20,11 @@ from jax import Array
 from drivetrain_jax import analyses
 from drivetrain_jax._errors import InputError, nearest, shown
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax._units import with_unit
 from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analysis_names
-from drivetrain_jax.analysis._base import checked, dimensions_of, make_request
+from drivetrain_jax.analysis._base import dimensions_of, make_request
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
-from drivetrain_jax.runs.axes import Axis, AxisTable, entry_of, spread
+from drivetrain_jax.runs import toml
+from drivetrain_jax.runs.axes import Axis, axis_table, check_count, entry_of, spread
 from drivetrain_jax.runs.run import run
 from drivetrain_jax.runs.scene import FUNCTION, Scene
 from drivetrain_jax.systems import Model, System, get_system, system_names
@@ -80,67 +80,35 @@ def sweep(
         value = f" = {shown(over)}" if over else ": empty"
         raise InputError(f"over{value}; expected values by the name of a parameter")
     _check_concrete(system, over, options)
+    outputs = [outputs] if isinstance(outputs, str) else outputs
     of_another_package = isinstance(function, analyses.AnalysisFunction)
     name = function.name if of_another_package else getattr(function, "__name__", "")
+    results, dims = (), ()
     if of_another_package or (name in analysis_names() and getattr(analyses, name, None) is function):
         _, analysis = analyses.model_and_analysis(name, system)
         if system.name in system_names() and get_system(system.name) is type(system):
             return run(_scene_table(name, system, over, outputs, options), out=out, fresh=fresh)
         # A scene names its system, so any other class is that of a function.
-        names = [outputs] if isinstance(outputs, str) else outputs
-        request = make_request(type(system), analysis, names, options, {*over})
-        dims = dimensions_of(analysis, type(system), request, system.values)
-        scene = _function_scene(function, system, over, outputs, options, analysis.variables, dims)
-        return run(scene, out=out, fresh=fresh)
-    return run(_function_scene(function, system, over, outputs, options), out=out, fresh=fresh)
+        request = make_request(type(system), analysis, outputs, options, {*over})
+        results, dims = analysis.variables, dimensions_of(analysis, type(system), request, system.values)
+    return run(_function_scene(function, system, over, outputs, options, results, dims), out=out, fresh=fresh)
 
 
 def _scene_table(
     name: str, system: System, over: Mapping[str, Any], outputs: Sequence[str] | None, options: Mapping[str, Any]
 ) -> dict[str, Any]:
     """The scene of an analysis of an installed system."""
-    # An empty list stands for a default of none.
     conversions = system.physical.conversions if system.physical else ()
     varied = {*over, *(rule.parameter for rule in conversions if rule.needs[0] in over)}
-    varied |= {key for key, value in system.values.items() if isinstance(value, tuple) and not value}
-    kept = {key: value for key, value in system.values.items() if key not in varied}
-    fixed = {key: _plain(key, value, system.parameter(key).listed) for key, value in kept.items()}
-    axes = {key: value if isinstance(value, Mapping) else {"values": _row(key, value)} for key, value in over.items()}
+    # An empty list stands for a default of none.
+    fixed = {
+        key: value
+        for key, value in system.values.items()
+        if not (key in varied or (isinstance(value, tuple) and not value))
+    }
+    axes = {key: value if isinstance(value, Mapping) else {"values": value} for key, value in over.items()}
     table = {"system": system.name, "analysis": name, "axes": axes, "fixed": fixed, "options": dict(options)}
-    return table if outputs is None else table | {"outputs": [outputs] if isinstance(outputs, str) else list(outputs)}
-
-
-def _plain(name: str, value: Any, listed: bool) -> Any:
-    """A fixed value as a scene has it."""
-    if isinstance(value, str):
-        return value
-    if isinstance(value, tuple) or (listed and np.ndim(value) == 1):
-        return [_plain(f"{name}[{i}]", entry, False) for i, entry in enumerate(value)]
-    if np.ndim(value):
-        raise InputError(f"{name}: an array of the shape {np.shape(value)}; expected a number, or {name} in over")
-    return float(value)
-
-
-def _row(name: str, values: Any) -> list[Any]:
-    """Numbers, and texts such as ``"18 deg"``, which the scene converts."""
-    values = with_unit(values)
-    written = isinstance(values, (list, tuple)) and any(isinstance(value, str) for value in values)
-    return list(values) if written else _numbers(name, values)
-
-
-def _numbers(name: str, values: Any) -> list[float]:
-    try:
-        row = np.asarray(values)
-        if row.dtype.kind in "bcM" or np.ma.is_masked(values):
-            raise TypeError(row.dtype)
-        array = row.astype(float)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"over.{name}: got {shown(values)}; expected numbers") from None
-    if array.ndim != 1 or not array.size:
-        raise InputError(
-            f"over.{name}: got an array of the shape {array.shape}; expected one of the shape (N,), N >= 1"
-        )
-    return array.tolist()
+    return table if outputs is None else table | {"outputs": list(outputs)}
 
 
 def _function_scene(
@@ -164,9 +132,12 @@ def _function_scene(
         raise InputError(f"over.{OUTCOME.name}: the name of a result; expected another name")
     for name, entries in over.items():
         described = known.get(entry_of(name)[0], Parameter(name, "1", name))
+        if described.choices or described.text:
+            raise InputError(f"over.{name}: a word cannot vary; expected numbers")
         scalar = replace(described, name=name, listed=False, broadcast=False)
-        row = [checked(scalar, value, "over.") for value in _row(name, entries)]
-        values[name] = spread(AxisTable(values=[*_numbers(name, row)]), f"over.{name}")
+        table, _ = axis_table(scalar, name, toml.plain(entries), "over", keep=False)
+        check_count(f"over.{name}", table, continuous=False)
+        values[name] = spread(table, f"over.{name}")
     name = re.sub(r"\W", "_", getattr(function, "__name__", "function")).strip("_") or "value"
 
     keywords = {"outputs": outputs} if results and outputs is not None else {}
@@ -192,17 +163,11 @@ def _function_scene(
     return Scene(kind, analysis, request, axes, False, fixed, f"{name} of {kind.title}", text)
 
 
+@dataclass(frozen=True)
 class _Once:
     """A function that compares equal to any other; the digest in the cache key distinguishes functions."""
 
-    def __init__(self, call: Callable[..., Any]) -> None:
-        self.call = call
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Once)
-
-    def __hash__(self) -> int:
-        return 0
+    call: Callable[..., Any] = field(compare=False)
 
 
 @lru_cache(maxsize=16)
@@ -296,8 +261,7 @@ def _named(result: Any, name: str) -> dict[str, Array]:
 
 def _wanted(outputs: Sequence[str] | None, known: Sequence[str], name: str) -> list[str]:
     """Names of the results to store; the outcome is always one."""
-    asked = known if outputs is None else [outputs] if isinstance(outputs, str) else outputs
-    wanted = [key for key in asked if key != OUTCOME.name]
+    wanted = [key for key in (known if outputs is None else outputs) if key != OUTCOME.name]
     for key in wanted:
         if key not in known:
             raise InputError(f"outputs: {key!r} is not a result of {name}{nearest(str(key), known)}")
@@ -318,11 +282,10 @@ def _check_concrete(*values: Any) -> None:
 def replaced(system: Any, point: Mapping[str, Any]) -> Any:
     """``system`` with these parameters, keys or attributes, or entries of them, replaced."""
     for name, value in point.items():
-        base, entry = entry_of(name)
+        base = entry_of(name)[0]
         if base not in (names := _names(system)):
             raise InputError(f"over.{name}: unknown to a {type(system).__name__}{nearest(base, names)}")
-        old = system[base] if isinstance(system, Mapping) else getattr(system, base)
-        value = _number(system, old, name, value) if entry is None else _with_entry(old, entry, value, name)
+        value = _replaced(system, system[base] if isinstance(system, Mapping) else getattr(system, base), name, value)
         if isinstance(system, Mapping):
             system = {**system, base: value}
         else:
@@ -339,21 +302,18 @@ def _names(system: Any) -> list[str]:
     return list(getattr(system, "_fields", getattr(system, "__dict__", ())))
 
 
-def _number(system: Any, old: Any, name: str, value: Array) -> Array:
-    """``value``, which may stand for the number ``old``; a number of a system may be missing."""
-    listed = isinstance(old, (list, tuple)) or getattr(old, "ndim", 0) > 0
-    declared = isinstance(system, System) and system.parameter(name).is_number
-    if not (declared or old is None or (jax.tree_util.all_leaves([old]) and not listed and not isinstance(old, str))):
+def _replaced(system: Any, old: Any, name: str, value: Array) -> Any:
+    """``old`` with ``value`` in its place, or in place of the entry that ``name`` names."""
+    (base, entry), listed = entry_of(name), isinstance(old, (list, tuple)) or getattr(old, "ndim", 0) > 0
+    if entry is None:
+        # A number of a system may be missing.
+        declared = isinstance(system, System) and system.parameter(name).is_number
+        if declared or old is None or (jax.tree_util.all_leaves([old]) and not listed and not isinstance(old, str)):
+            return value
         kind = "an array" if hasattr(old, "ndim") else f"a {type(old).__name__}"
         allowed = f'one entry, for example "{name}[0]"' if listed else "a number"
         raise InputError(f"over.{name}: {kind} cannot vary as a whole; expected {allowed}")
-    return value
-
-
-def _with_entry(old: Any, entry: int, value: Array, name: str) -> Any:
-    """``old``, an array, list or tuple, with one number replaced."""
-    base = entry_of(name)[0]
-    if not (isinstance(old, (list, tuple)) or getattr(old, "ndim", 0) > 0):
+    if not listed:
         raise InputError(f"over.{name}: {base} is not a list; expected {base}")
     if entry >= len(old):
         allowed = f"expected {base}[0] to {base}[{len(old) - 1}]" if len(old) else f"{base} is empty"

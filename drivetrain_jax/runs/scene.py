@@ -20,7 +20,7 @@ from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis import OUTCOME, Analysis, Request, Solver, analyses_of, get_analysis
 from drivetrain_jax.analysis._base import checked, checked_solvers, dimensions_of, make_request
 from drivetrain_jax.runs import toml
-from drivetrain_jax.runs.axes import MAX_POINTS, MAX_RANGES, Axis, AxisTable, check_count, entry_of, in_units, spread
+from drivetrain_jax.runs.axes import MAX_POINTS, MAX_RANGES, Axis, AxisTable, axis_table, check_count, entry_of, spread
 from drivetrain_jax.runs.physical import described, with_parameters
 from drivetrain_jax.systems import System, get_system, register, system_names
 
@@ -298,15 +298,21 @@ def axes_of(
         raise InputError("points: given together with axes; expected one of the two")
     if analysis.continuous:
         _check_ranges(axes, points, analysis)
-    swept = {name: _swept_parameter(system, "points" if points else "axes", name) for name in axes or points}
-    if points:
-        return _points(points, system, swept), True
+    where = "points" if points else "axes"
+    swept = {name: _swept_parameter(system, where, name) for name in axes or points}
+    specs = {}
     for name, parameter in swept.items():
         if analysis.continuous and parameter.integer:
             allowed = f"allowed for {analysis.name} are parameters with a continuous range"
             raise InputError(f"axes.{name}: an integer; {allowed}")
-    specs = {name: _axis_table(system, swept[name], name, value) for name, value in axes.items()}
-    counts = {name: check_count(name, spec, analysis.continuous) for name, (spec, _) in specs.items()}
+        if points and not isinstance(points[name], list):
+            raise InputError(f"points.{name} = {shown(points[name])}: expected a list of numbers")
+        # The unit of physical data is that of the scene.
+        keep = system.physical is not None and entry_of(name)[0] in system.physical.names
+        specs[name] = axis_table(parameter, name, (axes or points)[name], where, keep=keep)
+    if points:
+        return _points(points, specs), True
+    counts = {name: check_count(f"axes.{name}", spec, analysis.continuous) for name, (spec, _) in specs.items()}
     total = math.prod(counts.values())
     if total > MAX_POINTS:
         raise InputError(f"axes: {clipped(str(total))} points; expected up to {MAX_POINTS}")
@@ -314,7 +320,13 @@ def axes_of(
     if most * _BYTES > present:
         name = max(counts, key=lambda name: counts[name])
         raise InputError(f"axes.{name}.num = {most}: allowed with this memory is up to {int(present / _BYTES)}")
-    return tuple(_axis(name, *spec) for name, spec in specs.items()), False
+    found = []
+    for name, (table, scalar) in specs.items():
+        values = spread(table, f"axes.{name}")
+        for value in values if scalar.integer else ():
+            checked(scalar, float(value), "axes.")
+        found.append(_axis(name, values, scalar))
+    return tuple(found), False
 
 
 def _check_ranges(axes: Mapping[str, Any], points: Mapping[str, Any], analysis: Analysis) -> None:
@@ -324,48 +336,18 @@ def _check_ranges(axes: Mapping[str, Any], points: Mapping[str, Any], analysis: 
         raise InputError(f"axes: {len(axes)} are given; {analysis.name} allows 1 to {MAX_RANGES}")
 
 
-def _axis_table(system: type[System], parameter: Parameter, name: str, keys: Any) -> tuple[AxisTable, Parameter]:
-    """The keys of an axis with numbers for texts, and the range of a value in their unit."""
-    if isinstance(keys, list):
-        keys = {"values": keys}
-    if not isinstance(keys, Mapping):
-        allowed = "expected a table { start, stop, num } or { values }, or a row of values"
-        raise InputError(f"axes.{name} = {shown(keys)}: {allowed}")
-    if isinstance(num := keys.get("num"), float) and num.is_integer():
-        # Options and parameters also accept 1e3 for 1000.
-        keys = {**keys, "num": int(num)}
-    table = toml.converted(keys, AxisTable, f"axes.{name}.")
-    return in_units(table, parameter, "axes.", keep=_is_physical(system, name))
-
-
-def _is_physical(system: type[System], name: str) -> bool:
-    return system.physical is not None and entry_of(name)[0] in system.physical.names
-
-
-def _axis(name: str, table: AxisTable, scalar: Parameter) -> Axis:
+def _axis(name: str, values: Any, scalar: Parameter) -> Axis:
     base, entry = entry_of(name)
-    values = spread(table, f"axes.{name}")
-    if scalar.integer:
-        for value in values:
-            checked(scalar, float(value), "axes.")
-    return Axis(name, replace(scalar, name=base), entry, values.astype(np.int64) if scalar.integer else values)
+    return Axis(name, replace(scalar, name=base), entry, np.asarray(values, np.int64 if scalar.integer else float))
 
 
-def _points(points: Mapping[str, Any], system: type[System], swept: Mapping[str, Parameter]) -> tuple[Axis, ...]:
+def _points(points: Mapping[str, Any], specs: Mapping[str, tuple[AxisTable, Parameter]]) -> tuple[Axis, ...]:
     """Columns of parameter values of equal length."""
-    for name, values in points.items():
-        if not isinstance(values, list):
-            raise InputError(f"points.{name} = {shown(values)}: expected a list of numbers")
     lengths = {name: len(values) for name, values in points.items()}
     if len(set(lengths.values())) > 1 or not all(lengths.values()):
         listed = ", ".join(f"{name} has {length}" for name, length in lengths.items())
         raise InputError(f"points: {listed}; expected lists of one length, at least 1")
-    columns = []
-    for name, values in points.items():
-        table, scalar = in_units(AxisTable(values=values), swept[name], "points.", keep=_is_physical(system, name))
-        numbers, (base, entry) = np.array(table.values, np.int64 if scalar.integer else float), entry_of(name)
-        columns.append(Axis(name, replace(scalar, name=base), entry, numbers))
-    return tuple(columns)
+    return tuple(_axis(name, table.values, scalar) for name, (table, scalar) in specs.items())
 
 
 def _swept_parameter(system: type[System], where: str, name: str) -> Parameter:
