@@ -162,8 +162,10 @@ def _numbers(parameter: Parameter, value: Any, physical: bool) -> Any:
         return tuple(_numbers(parameter, end, physical) for end in value)
     if isinstance(value, list) and any(isinstance(entry, str) for entry in value):
         return np.array([checked(parameter, entry, "") for entry in value])
-    if not physical or isinstance(value, (str, int, float)):
-        return checked(parameter, value, "") if physical or isinstance(value, str) else value
+    if isinstance(value, str) or (physical and isinstance(value, (int, float))):
+        return checked(parameter, value, "")
+    if not physical:
+        return value
     try:
         numbers = np.asarray(value, float)
     except (TypeError, ValueError):
@@ -186,37 +188,36 @@ def read_table(path: Path) -> dict[str, Any]:
     table.
     """
     rows = _rows(path).dropna(how="all")
-    if len(rows) < 2:
-        raise InputError(f"data = {str(path)!r}: no values; expected a row of names and rows of values")
     columns: dict[str, Any] = {}
+    if len(rows) < 2:
+        raise _wrong_table(path, "no values", "a row of names and rows of values")
     for header, *cells in (rows[number].tolist() for number in rows):
-        if isinstance(header, str):
-            name, unit = _HEADER.fullmatch(header).groups()  # pyright: ignore[reportOptionalMemberAccess]
-            if name == _NAMES:
-                continue
-            if name in columns:
-                raise InputError(f"data = {str(path)!r}: has two columns {name}; expected one")
-            count = max((i + 1 for i, cell in enumerate(cells) if isinstance(cell, str)), default=0)
-            if not count or not all(isinstance(cell, str) for cell in cells[:count]):
-                where = "has an empty cell between values" if count else "is empty"
-                allowed = "expected a value in every row, or in the first"
-                raise InputError(f"data = {str(path)!r}: column {name} {where}; {allowed}")
-            values = [_value(path, name, cell.strip(), unit) for cell in cells[:count]]
-            columns[name] = values if count > 1 else values[0]
+        name, unit = _HEADER.fullmatch(header).groups() if isinstance(header, str) else (_NAMES, "")  # pyright: ignore[reportOptionalMemberAccess]
+        if name == _NAMES:
+            continue
+        values = [_value(path, name, cell.strip(), unit) for cell in cells if isinstance(cell, str)]
+        if name in columns:
+            raise _wrong_table(path, f"two columns {name}", "one")
+        if not values or not all(isinstance(cell, str) for cell in cells[: len(values)]):
+            where = "has an empty cell between values" if values else "is empty"
+            raise _wrong_table(path, f"column {name} {where}", "a value in every row, or in the first")
+        columns[name] = values if len(values) > 1 else values[0]
     return columns
+
+
+def _wrong_table(path: Path, what: str, allowed: str) -> InputError:
+    return InputError(f"data = {str(path)!r}: {what}; expected {allowed}")
 
 
 def _value(path: Path, name: str, text: str, unit: str | None) -> Any:
     """A cell as a number, with a unit as text; a word stays a word."""
     measured = bool(unit) and unit != "1"
     try:
-        value = float(text)
+        return f"{float(text)!r} {unit}" if measured else float(text)
     except ValueError:
         if measured:
-            allowed = f"expected a number in {unit}, with a decimal point"
-            raise InputError(f"data = {str(path)!r}: {name} = {clipped(text)!r}: {allowed}") from None
+            raise _wrong_table(path, f"{name} = {text!r}", f"a number in {unit}, with a decimal point") from None
         return text
-    return f"{value!r} {unit}" if measured else value
 
 
 def _rows(path: Path) -> pd.DataFrame:
@@ -226,18 +227,16 @@ def _rows(path: Path) -> pd.DataFrame:
     kind = path.suffix.lower()
     how: dict[str, Any] = {"header": None, "dtype": str, "keep_default_na": False, "na_values": [""]}
     try:
+        if kind == ".xlsx":
+            return pd.read_excel(path, **how)
         if kind == ".csv":
             # Spreadsheets write a byte order mark, and semicolons where the comma is a decimal mark.
             first = path.read_text("utf-8-sig").partition("\n")[0]
             return pd.read_csv(path, sep=max(",;\t", key=first.count), encoding="utf-8-sig", **how)
-        if kind == ".xlsx":
-            return pd.read_excel(path, **how)
     except ImportError:
         raise InputError("data: .xlsx needs the package openpyxl; pip install 'drivetrain_jax[tables]'") from None
-    except OSError as error:
-        raise InputError(f"data = {str(path)!r}: {error.strerror or error}; expected a table") from None
     # Readers raise exceptions of zip files, XML and their own for a damaged file.
     except Exception as error:
-        allowed = "CSV in UTF-8 with a value a column, numbers with a decimal point" if kind == ".csv" else "a workbook"
-        raise InputError(f"data = {str(path)!r}: {clipped(str(error))}; expected {allowed}") from None
-    raise InputError(f"data = {str(path)!r}: expected a file that ends in .csv or .xlsx")
+        kinds = {".csv": "CSV in UTF-8 with a value a column, numbers with a decimal point", ".xlsx": "a workbook"}
+        raise _wrong_table(path, clipped(getattr(error, "strerror", None) or str(error)), kinds[kind]) from None
+    raise _wrong_table(path, "not a table", "a file that ends in .csv or .xlsx")
