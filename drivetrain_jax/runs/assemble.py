@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.consolidate import CONVENTIONS, Entry, Labelled, ResultFile, release
 from drivetrain_jax.store.files import command, flush_tree, move_folder, now, versions
 from drivetrain_jax.store.parts import Arrays, PartsFolder
-from drivetrain_jax.systems import System
+from drivetrain_jax.systems import PhysicalData, System
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -189,15 +189,6 @@ def _drawn(system: type[System]) -> dict[str, Any]:
     return shown | ({"periods_per_turn": system.periods_per_turn} if system.periods_per_turn else {})
 
 
-def _physical(scene: Scene) -> dict[str, str]:
-    """The physical data of a scene that do not vary."""
-    if not scene.data or scene.system.physical is None:
-        return {}
-    known = {name: (value, scene.system.physical.quantity(name)) for name, value in scene.data.items()}
-    about = {n: {"value": value, "units": q.units, "long_name": q.long_name} for n, (value, q) in known.items()}
-    return {"physical_data": json.dumps(about)}
-
-
 def _finite(value: Any) -> Any:
     """``value`` for JSON, which has no infinity; the word "inf" is read by every parser of numbers."""
     return str(value) if value == math.inf else value
@@ -209,6 +200,10 @@ def result_attrs(scene: Scene) -> dict[str, str]:
     for name, value in scene.fixed.items():
         parameter = scene.system.parameter(name)
         fixed[name] = {"value": _finite(value), "units": parameter.units, "long_name": parameter.long_name}
+    physical, data = cast(PhysicalData, scene.system.physical), {}
+    for name, value in scene.data.items():
+        quantity = physical.quantity(name)
+        data[name] = {"value": value, "units": quantity.units, "long_name": quantity.long_name}
     # An axis given in physical data takes the role of its parameter.
     dim_of = {axis.name: axis.dim for axis in scene.axes if axis.given}
     roles = {role: dim_of.get(name, name) for role, name in scene.system.roles.items()}
@@ -228,7 +223,7 @@ def result_attrs(scene: Scene) -> dict[str, str]:
         "options": json.dumps({name: _finite(value) for name, value in scene.request.options.items()}),
         "scene": scene.text,
         "fixed_parameters": json.dumps(fixed),
-        **_physical(scene),
+        **({"physical_data": json.dumps(data)} if data else {}),
         "drivetrain_jax_version": version,
         "versions": ", ".join(f"{name} {number}" for name, number in installed.items()),
         "machine": machine(),

@@ -99,14 +99,10 @@ class Job:
         return _programs.numerics_of(self.problem.system, self.problem.analysis, self.route.name)
 
     @property
-    def numerics_attrs(self) -> dict[str, str]:
-        """``numerics`` and ``numerics_detail`` as attributes of a result or plan."""
-        return {"numerics": self.numerics, "numerics_detail": json.dumps(self.numerics_detail)}
-
-    @property
     def attrs(self) -> dict[str, str | float]:
         """Attributes that identify the result; effort and time are added at the end."""
-        return {"digest": self.digest, **self.numerics_attrs, "wall_time_s": 0.0}
+        detail = json.dumps(self.numerics_detail)
+        return {"digest": self.digest, "numerics": self.numerics, "numerics_detail": detail, "wall_time_s": 0.0}
 
     @cached_property
     def digest(self) -> str:

@@ -144,7 +144,7 @@ class Output:
     def plan(self, reused: ReusedPoints = NO_REUSE, fresh: bool = False) -> dict[str, Any]:
         """The digest of new parts, and the entries that a reader needs to interpret them."""
         return {
-            "digest": self.job.digest,
+            **self.job.attrs,
             **self._replaced,
             "store": self.store,
             "fresh": fresh,
@@ -153,7 +153,6 @@ class Output:
             # What explains later how stored work differs from a scene.
             "scene": self.job.scene.text,
             "drivetrain_jax_version": drivetrain_jax.__version__,
-            **self.job.numerics_attrs,
         }
 
     def resumes(self, reused: ReusedPoints, fresh: bool) -> bool:

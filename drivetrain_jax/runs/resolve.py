@@ -47,34 +47,23 @@ def choose_atlas(scene: Scene) -> tuple[Ranges, int | None] | None:
     None if the scene does not request an atlas and ``auto`` predicts no lower cost with one. Raises :class:`InputError` if
     a scene that requests an atlas varies too many parameters.
     """
-    if scene.analysis.name != "floquet" or scene.request.method not in ("auto", "atlas"):
+    requested = scene.request.method == "atlas"
+    if scene.analysis.name != "floquet" or not (requested or scene.request.method == "auto"):
         return None
-    ranges = atlas_ranges(scene)
-    several = None if scene.zipped else next((axis for axis in scene.axes if axis.also), None)
-    if several is not None:
-        if scene.request.method == "atlas":
-            names = ", ".join(part.name for part in several.together)
-            raise InputError(
-                f"options.method = 'atlas': axes.{several.shown.name} changes {names} together; expected auto and direct"
-            )
-        return None
-    if whole := next((name for name in ranges if scene.system.parameter(entry_of(name)[0]).integer), ""):
-        if scene.request.method == "atlas":
-            raise InputError(f"options.method = 'atlas': {whole} is an integer; expected auto and direct")
-        return None
-    if scene.request.method == "atlas":
-        if len(ranges) > MAX_RANGES:
-            allowed = f"expected at most {MAX_RANGES}"
-            raise InputError(f"options.method = 'atlas': the scene varies {len(ranges)} parameters; {allowed}")
-        return (ranges, None) if ranges else None
+    ranges, refused = atlas_ranges(scene), ""
+    if several := None if scene.zipped else next((axis for axis in scene.axes if axis.also), None):
+        names = ", ".join(part.name for part in several.together)
+        refused = f"axes.{several.shown.name} changes {names} together; expected auto and direct"
+    elif whole := next((name for name in ranges if scene.system.parameter(entry_of(name)[0]).integer), ""):
+        refused = f"{whole} is an integer; expected auto and direct"
+    elif len(ranges) > MAX_RANGES:
+        refused = f"the scene varies {len(ranges)} parameters; expected at most {MAX_RANGES}"
+    if refused and requested:
+        raise InputError(f"options.method = 'atlas': {refused}")
+    if refused or not ranges or requested:
+        return (ranges, None) if ranges and not refused else None
     model, grid = scene.system.models.get(ANALYSIS.name), Grid.of(scene)
-    if (
-        model is None
-        or model.smooth is None
-        or not 0 < len(ranges) <= MAX_RANGES
-        or grid.size < _WORTHWHILE
-        or scene.request.options["rtol"] < _FINEST
-    ):
+    if model is None or model.smooth is None or grid.size < _WORTHWHILE or scene.request.options["rtol"] < _FINEST:
         return None
     solves = _affordable_solves(scene, grid, ranges)
     return (ranges, solves) if solves >= _FEWEST[len(ranges) - 1] else None

@@ -103,7 +103,11 @@ def run_to_file(
     ``store`` is ``hdf5`` or ``zarr``, of which each block is a shard; by default the name of ``out`` decides.
     """
     job = _job(scene, overrides, on_disk=True)
-    output = Output(out, job, _store(out, store))
+    named = ZARR if out.suffix.lower() == ".zarr" else HDF5
+    if named == ZARR and store == HDF5:
+        allowed = f"expected a name such as {out.stem}.nc, or `drivetrain run --store zarr`"
+        raise InputError(f"out = {str(out)!r}: names a Zarr store; {allowed}")
+    output = Output(out, job, store or named)
     if output.store == ZARR and not job.route.is_pointwise:
         raise InputError("store = 'zarr': not available for an atlas; expected hdf5, or a scene with direct solves")
     if not fresh and output.state == "complete":
@@ -120,18 +124,9 @@ def run_to_file(
     return _into(output, output.reused_points(paths, fresh), fresh, executor, report)
 
 
-def _store(out: Path, asked: str | None) -> str:
-    """The store for ``out``; :class:`InputError` for an HDF5 file with the name of a Zarr store."""
-    named = out.suffix.lower() == ".zarr"
-    if named and asked == HDF5:
-        allowed = f"expected a name such as {out.stem}.nc, or `drivetrain run --store zarr`"
-        raise InputError(f"out = {str(out)!r}: names a Zarr store; {allowed}")
-    return asked or (ZARR if named else HDF5)
-
-
 def _into(output: Output, reused: ReusedPoints, fresh: bool, executor: Threads, report: Report | None) -> Progress:
     """Start or resume the result of ``output``; the points ``reused`` are reused."""
-    job, parts, progress = output.job, output.parts, _progress(output.job)
+    job, parts, progress = output.job, output.parts, Progress.of(output.job)
     begins = False
     try:
         parts.open()
@@ -164,11 +159,6 @@ def _into(output: Output, reused: ReusedPoints, fresh: bool, executor: Threads, 
     return progress
 
 
-def _progress(job: Job) -> Progress:
-    """The counts before a run; those of an atlas are solves, which are not points of a grid."""
-    return Progress(0, kind="direct solves") if job.scene.analysis.continuous else Progress(job.total)
-
-
 def _job(scene: str | Path | Mapping[str, Any] | Scene, overrides: Mapping[str, Any] | None, on_disk: bool) -> Job:
     """The job of a scene, checked against the memory of this machine."""
     job = resolve(scene if isinstance(scene, Scene) else load_scene(scene, overrides))
@@ -180,7 +170,7 @@ def _job(scene: str | Path | Mapping[str, Any] | Scene, overrides: Mapping[str, 
 
 
 def _in_memory(job: Job, executor: Threads, report: Report | None) -> xr.Dataset:
-    progress = _progress(job)
+    progress = Progress.of(job)
     try:
         work = Work(executor, report)
         result = job.route.in_memory(job, work, progress)

@@ -7,6 +7,7 @@ import os
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
@@ -52,15 +53,7 @@ def read(
             if key.startswith("axes.") and isinstance(fixed := tree.get("fixed"), dict):
                 # The axis takes the place of the fixed value.
                 fixed.pop(key.split(".")[1], None)
-    return tree, write(_with_axes_as_tables(tree)) if text is None else text
-
-
-def _with_axes_as_tables(tree: dict[str, Any]) -> dict[str, Any]:
-    """``tree`` with ``{ values = [...] }`` for an axis that is given as a row of values."""
-    axes = tree.get("axes")
-    if not isinstance(axes, dict):
-        return tree
-    return {**tree, "axes": {n: {"values": axis} if isinstance(axis, list) else axis for n, axis in axes.items()}}
+    return tree, write(tree) if text is None else text
 
 
 def plain(value: Any) -> Any:
@@ -133,10 +126,8 @@ def parse_value(text: str) -> Any:
         content = {}
     if list(content) == ["value"]:
         return content["value"]
-    try:
+    with suppress(ValueError):
         return float(text)
-    except ValueError:
-        pass
     if (inner := text.strip()).startswith("[") and inner.endswith("]") and not set(inner[1:-1]) & set("[]{}\"'"):
         return [parse_value(entry.strip()) for entry in inner[1:-1].split(",")]
     return text
@@ -158,23 +149,19 @@ def entries(table: Mapping[str, Any]) -> list[str]:
 
 
 def _key(name: str) -> str:
-    return name if _BARE_KEY.fullmatch(name) else _quoted(name)
-
-
-def _quoted(text: str) -> str:
-    # TOML requires an escape for one control character that JSON does not escape.
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return name if _BARE_KEY.fullmatch(name) else _value(name)
 
 
 def _value(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        return _quoted(value)
+        # TOML requires an escape for one control character that JSON does not escape.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, Mapping):
         return "{ " + ", ".join(entries(value)) + " }"
     if isinstance(value, Sequence):
-        return "[" + ", ".join(_value(entry) for entry in value) + "]"
+        return "[" + ", ".join(map(_value, value)) + "]"
     return repr(value)
 
 

@@ -67,6 +67,11 @@ class Progress:
     kind: str = "points"
     note: str = ""
 
+    @classmethod
+    def of(cls, job: Job) -> Progress:
+        """The counts before a run; those of an atlas are solves, which are not points of a grid."""
+        return cls(0, kind="direct solves") if job.scene.analysis.continuous else cls(job.total)
+
     def __str__(self) -> str:
         return f"points: total={self.total} computed={self.computed} reused={self.reused} failed={self.failed}"
 
@@ -164,10 +169,6 @@ def run_threads(
             threads.cache_clear()
 
 
-class Mismatch(ChunkError):
-    """Raised if code, versions or instruction set of a worker differ from those of the run."""
-
-
 @lru_cache(maxsize=1)
 def _first(job: Job) -> Job:
     """The first of equal jobs that this worker has received; it holds the compiled kernels."""
@@ -180,7 +181,7 @@ def compute(job: Job, store: BlockStore | None, digest: str, block: Block, numbe
     ``digest`` is that of the job in the driver.
     """
     if job.digest != digest:
-        raise Mismatch("code, versions or instruction set differ from those of the run")
+        raise ChunkError("code, versions or instruction set differ from those of the run")
     results = _first(job).compute_block(block)
     if store is None:
         return results

@@ -197,7 +197,7 @@ def test_a_worker_of_another_kind_is_refused_before_it_computes(grid_scene, monk
     monkeypatch.setattr("drivetrain_jax._programs.versions", lambda _: {"jax": "9"})
     copy = pickle.loads(sent)
     monkeypatch.setattr(type(job), "compute", lambda *_: pytest.fail("it computes"))
-    with pytest.raises(work.Mismatch, match=r"^code, versions or instruction set differ from those of the run$"):
+    with pytest.raises(ChunkError, match=r"^code, versions or instruction set differ from those of the run$"):
         work.compute(copy, None, expected, Block(0), 0)
 
 

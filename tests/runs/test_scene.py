@@ -85,7 +85,7 @@ def test_an_axis_may_be_a_row_of_values(tmp_path, values):
     scene = load_scene({**GOOD, "axes": {"a": values}})
     assert scene.axes[0].values.tolist() == [0, 0.5, 1]
     # The text of a scene is that of a scene file, whatever its source.
-    assert "a = { values = [0.0, 0.5, 1.0] }" in scene.text.replace("[0,", "[0.0,")
+    assert "a = [0.0, 0.5, 1.0]" in scene.text.replace("[0,", "[0.0,")
     changed = load_scene(GOOD, {"axes.a": values})
     assert changed.axes[0].values.tolist() == [0, 0.5, 1] and changed.text == scene.text
     assert load_scene({**GOOD, "axes": {"a": range(3)}}).axes[0].values.tolist() == [0, 1, 2]
