@@ -35,8 +35,8 @@ _ROUNDINGS = 4 * np.finfo(float).eps
 class NotReusable(InputError):
     """Raised if no point of a result can be reused; ``damage`` names the damaged variables of the result, if any."""
 
-    def __init__(self, path: Path, why: str, allowed: str, damage: str = "") -> None:
-        super().__init__(f"reuse = {str(path)!r}: {why}; expected {allowed}")
+    def __init__(self, path: Path, why: str, remedy: str, damage: str = "") -> None:
+        super().__init__(f"reuse = {str(path)!r}: {why}; {remedy}")
         self.damage = damage
 
 
@@ -125,18 +125,18 @@ def find(job: Job, path: Path) -> ReusableResult:
     except InputError as error:
         raise InputError(str(error).replace("file = ", "reuse = ", 1)) from None
     if "digest" not in attrs:
-        raise NotReusable(path, "not a result of drivetrain_jax", "such a result")
+        raise NotReusable(path, "not a result of drivetrain_jax", "expected such a result")
     try:
         scene = restore_scene(attrs.get("scene"))
         reasons = differences_of(scene, attrs, job, points=False)
     except InputError as error:
         reasons, scene = [_not_valid(error)], job.scene
     if reasons:
-        raise NotReusable(path, reasons[0], "a result that differs in its points only")
+        raise NotReusable(path, reasons[0], "expected a result that differs in its points only")
     # The checksums of the new result would hide damage.
     wrong = checksums.named(checksums.damaged(path) or misfits(consolidate.layout(path), scene))
     if damage := wrong or ("" if "checksums" in attrs else "it has no checksums"):
-        raise NotReusable(path, f"damaged ({damage})", "to restore the file or compute it again", damage)
+        raise NotReusable(path, f"damaged ({damage})", "restore the file or compute it again", damage)
     grid = Grid.of(scene)
     theirs, ours = _same_points(scene, grid, job)
     if theirs.size:
@@ -144,7 +144,7 @@ def find(job: Job, path: Path) -> ReusableResult:
         kept = ~(outcome == Outcome.LOST).any(axis=tuple(range(1, outcome.ndim)))
         theirs, ours = theirs[kept], ours[kept]
     if not theirs.size:
-        raise NotReusable(path, "holds none of the points", "a result that shares some")
+        raise NotReusable(path, "holds none of the points", "expected a result that shares some")
     wanted = set(scene.request.outputs) <= set(job.scene.request.outputs)
     is_covered = wanted and np.unique(theirs).size == grid.size
     stored = tuple(variable.name for variable in result_variables(job.scene))
