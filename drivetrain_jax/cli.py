@@ -156,6 +156,7 @@ _SCENE = (
     _argument("--set", "KEY=VALUE", "replace an entry of the scene: fixed.zeta=0.002", action="append", default=[]),
     _DATA,
 )
+_SEVERAL: dict[str, Any] = {"nargs": "+", "action": "extend", "default": []}
 _QUESTIONS = ("least-damping", "widest-angle", "speed-windows")
 
 # The text of every command, and its arguments; the function has the name of the command.
@@ -188,7 +189,7 @@ _COMMANDS: dict[str, tuple[str, tuple[Any, ...]]] = {
     "plot": ("draw the figure of a result", (
         _file("files", "FILE.nc", "results; overlaid: methods of one analysis, or a chart and its atlas", nargs="+"),
         _file("--out", "FIGURE", "figure (.png, .pdf, .svg) or table of constants (.txt, .csv)", required=True),
-        _argument("--part", "name=LOW:HIGH", "part of an atlas: ranges, or name=value", nargs="+", action="extend", default=[]),
+        _argument("--part", "name=LOW:HIGH", "part of an atlas: ranges, or name=value", **_SEVERAL),
         _argument("--cells", "N", "cells per axis for an atlas (default: 800)", type=int),
         _argument("--units", "rpm,deg", "units of the axes (default: those of the scene)"),
     )),
@@ -494,7 +495,8 @@ def _check_place(out: Path, endings: tuple[str, ...]) -> None:
         what = "is a folder" if out.is_dir() else "not a regular file"
         raise InputError(f"out = {str(out)!r}: {what}; expected a new file, or one to replace")
     if out.suffix.lower() not in endings:
-        raise InputError(f"out = {str(out)!r}: expected a name that ends in {', '.join(endings)}")
+        printed = "; a browser prints the page as PDF" if out.suffix.lower() == ".pdf" else ""
+        raise InputError(f"out = {str(out)!r}: expected a name that ends in {', '.join(endings)}{printed}")
 
 
 def _write(out: Path, data: bytes | memoryview) -> int:

@@ -179,7 +179,12 @@ def amplitudes(dataset: xr.Dataset) -> list[xr.DataArray]:
 def _about_outcome(dataset: xr.Dataset) -> Iterator[str]:
     outcome = dataset["outcome"]
     counts = {word: int((outcome.values == code).sum()) for code, word in flag_words(outcome).items() if code}
-    wrong = ", ".join(f"{word.replace('_', ' ')} {count:,}" for word, count in counts.items() if count)
+    above = "have an error above the tolerance, so judge them by their error bound"
+    wrong = ", ".join(
+        f"{count:,} {above}" if word == "tolerance_not_met" else f"{word.replace('_', ' ')} {count:,}"
+        for word, count in counts.items()
+        if count
+    )
     points = f"{outcome.size:,} point{'s' if outcome.size != 1 else ''}"
     yield f"{points} computed, with these remarks: {wrong}." if wrong else f"{points} computed, all successfully."
 

@@ -41,7 +41,8 @@ def chart(source: str | Path | xr.Dataset, part: Mapping[str, float | tuple[floa
     has the stability boundaries (``boundary_NAME``, segments separated by NaN, for each value of the further parameters),
     if the system has them. A chart of two parameters has the tips of the tongues as well (``tip_NAME``, their names,
     ``tip_NAME_error``, ``tip_opens``, ``tip_proved``), and boxes that may contain more tips (``undecided_NAME``). Its
-    attribute ``proof`` says how many verdicts are proved. A chart of one parameter has its unstable ranges (``unstable_NAME``).
+    attribute ``proof`` says how many verdicts are proved. A chart of one parameter has its unstable ranges
+    (``unstable_NAME``).
 
     Raises :class:`InputError` for values outside the atlas, :class:`ChunkError` if a direct solve in a gap fails.
     """

@@ -315,6 +315,7 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
     if "verdict" in values and outcome.has_value:
         word = scene.analysis.variable("verdict").flags[int(values["verdict"])]
         sentence = f"{'; '.join(verdict_words(word, grows, scene.analysis.name == 'floquet'))}."
+    orders = order_crossings(scene, ordered, values)
     return PointResult(
         system=scene.system.name,
         analysis=scene.analysis.name,
@@ -329,8 +330,8 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
         remedy=scene.analysis.remedy(scene.request),
         advice=scene.analysis.advice(scene.request),
         growth=grows,
-        orders=order_crossings(scene, ordered, values),
-        sentence=sentence,
+        orders=orders,
+        sentence=sentence or (orders.sentence(values) if orders else ""),
     )
 
 
@@ -350,6 +351,10 @@ def _labels(job: Job, values: Mapping[str, Any], buffer: ResultBuffer) -> dict[s
     return {d.name: d.labels(sizes[d.name]) for d in job.scene.dimensions if d.name in sizes}
 
 
+# Most modes in the sentence about an order.
+_FIRST = 6
+
+
 @dataclass(frozen=True)
 class OrderCrossings:
     """The ``orders`` with their ``speeds`` (modes, orders) [rpm], and the operating range [rpm] if one is given."""
@@ -364,17 +369,27 @@ class OrderCrossings:
         return dict(zip(self.orders.per_turn, self.speeds.T, strict=True))
 
     def lines(self) -> list[str]:
-        """The speeds as a table, and those within the operating range as sentences."""
+        """The speeds as a table."""
         head = ["mode", *(f"{name} [rpm]" for name in self.columns)]
         modes = [
             [str(k), *(f"{x:.6g}" if np.isfinite(x) else "-" for x in row)] for k, row in enumerate(self.speeds, 1)
         ]
-        lines = [f"  speed of the {self.orders.shaft} at which an order meets the mode", *aligned([head, *modes])]
-        if self.operating:
-            low, high = self.operating
-            within = self.orders.within(self.speeds, low, high)
-            lines += [f"  from {low:g} to {high:g} rpm: {sentence}" for sentence in within]
-        return lines
+        return [f"  speed of the {self.orders.shaft} at which an order meets the mode", *aligned([head, *modes])]
+
+    def sentence(self, values: Mapping[str, Any]) -> str:
+        """The speeds within the operating range, or else the first ones; and the modes of ``values`` too near to that range."""
+        if not self.operating:
+            (name, column), *_ = self.columns.items()
+            met = [f"mode {k + 1} at {column[k]:.6g} rpm" for k in np.flatnonzero(np.isfinite(column))]
+            more = f" and {len(met) - _FIRST} more" if len(met) > _FIRST else ""
+            return f"{name[:1].upper()}{name[1:]} meets {', '.join(met[:_FIRST])}{more}." if met else ""
+        low, high = self.operating
+        said = [f"From {low:g} to {high:g} rpm {'; '.join(self.orders.within(self.speeds, low, high))}"]
+        if {"separation_margin", "required_margin"} <= values.keys():
+            near = 1 + np.flatnonzero(values["separation_margin"] < values["required_margin"])
+            modes = f"mode{'s' * (len(near) > 1)} {', '.join(map(str, near))}"
+            said += [f"{modes} lack{'s' * (len(near) == 1)} the required separation margin"] if len(near) else []
+        return f"{'; '.join(said)}."
 
 
 def order_crossings(scene: Scene, parameters: Mapping[str, Any], values: Mapping[str, Any]) -> OrderCrossings | None:
