@@ -113,10 +113,10 @@ def misfits(layout: Mapping[str, tuple[Any, tuple[int, ...]]], scene: Scene) -> 
     return [v.name for v in (() if scene.analysis.continuous else result_variables(scene)) if not fits(v)]
 
 
-def dimension_sizes(scene: Problem, grid: Grid, like: Arrays | None = None) -> dict[str, int]:
-    """Lengths of the dimensions of the results besides those of the sweep.
+def blank(scene: Problem, grid: Grid, like: Arrays | None = None) -> Arrays:
+    """Results of which none is computed, as arrays that take no memory.
 
-    Those that depend on the system are those of the results ``like``, or found by tracing.
+    Lengths of dimensions that depend on the system are those of the results ``like``, or found by tracing.
     """
     sizes, variables = {d.name: len(d.values) for d in scene.dimensions}, result_variables(scene)
     if not all(sizes[dim] for variable in variables for dim in variable.dims):
@@ -126,13 +126,8 @@ def dimension_sizes(scene: Problem, grid: Grid, like: Arrays | None = None) -> d
         shapes = {n: x.shape for n, x in like.items()} if like else result_shapes(scene, grid, scene.solvers[0])
         for variable in variables:
             sizes |= zip(reversed(variable.dims), reversed(shapes[variable.name]), strict=False)
-    return sizes
-
-
-def blank(scene: Problem, grid: Grid, like: Arrays | None = None) -> Arrays:
-    """Results of which none is computed, as arrays that take no memory; see :func:`dimension_sizes` for ``like``."""
-    sizes, arrays = dimension_sizes(scene, grid, like), {}
-    for v in result_variables(scene):
+    arrays = {}
+    for v in variables:
         value = np.array(PENDING if v.name == OUTCOME.name else v.missing, v.dtype)
         arrays[v.name] = np.broadcast_to(value, (*grid.result_shape, *(sizes[dim] for dim in v.dims)))
     return arrays

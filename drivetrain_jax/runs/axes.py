@@ -186,7 +186,8 @@ class Grid:
     """Points numbered from 0 in C order of ``axes`` (``shape``), or one point per entry of ``axes`` if ``zipped``.
 
     With a path axis each point is a line: ``axes`` lacks ``path``. ``path_position`` is its position among the axes of the
-    scene, or None for a line of one fixed value. ``result_bytes`` is the size of the results at a point.
+    scene, or None for a line of one fixed value. ``numbers`` are the ``fixed`` numbers that are arguments of compiled code,
+    ``result_bytes`` is the size of the results at a point.
     """
 
     axes: tuple[Axis, ...]
@@ -203,7 +204,15 @@ class Grid:
         """The grid of ``scene``; a fixed path parameter gives lines of one value."""
         parameters = scene.analysis.model(scene.system).parameters
         name, path = scene.path_axis, None
-        numbers = {n: value for n, value in _numbers(scene).items() if n != name}
+        # A model may conclude from 0, infinity or a default that a part is absent. Such numbers are constants of compiled
+        # code, and so are lists, whose entries may be equal or equally spaced.
+        numbers = {
+            n: value
+            for n in parameters
+            if n != name
+            and isinstance(value := scene.fixed.get(n), float)
+            and value not in (0.0, math.inf, scene.system.parameter(n).default)
+        }
         position = next((i for i, axis in enumerate(scene.axes) if axis.name == name), None)
         if position is not None:
             path = scene.axes[position]
@@ -284,18 +293,3 @@ class Grid:
             return tuple(self._spread(entry, shape) for entry in value)
         whole = isinstance(value, str) or (self.path is not None and value is self.path.values)
         return value if whole else np.broadcast_to(value, shape)
-
-
-def _numbers(scene: Problem) -> dict[str, float]:
-    """The fixed numbers of the model, without those from which it may conclude that a part is absent.
-
-    Such numbers are 0, infinity and defaults. They are constants of compiled code, and so are lists, whose entries may be
-    equal or equally spaced.
-    """
-    names = scene.analysis.model(scene.system).parameters
-    values = {name: scene.fixed[name] for name in names if name in scene.fixed}
-    return {
-        name: value
-        for name, value in values.items()
-        if isinstance(value, float) and value not in (0.0, math.inf, scene.system.parameter(name).default)
-    }

@@ -9,7 +9,7 @@ from drivetrain_jax.analysis.atlas import ANALYSIS
 from drivetrain_jax.runs.axes import MAX_RANGES, Grid, entry_of
 from drivetrain_jax.runs.job import Job, mean_cost
 from drivetrain_jax.runs.scene import Ranges, Scene, atlas_ranges
-from drivetrain_jax.runs.work import DIRECT, Route
+from drivetrain_jax.runs.work import DIRECT
 
 # Points below which "auto" solves directly: two more kernels would take longer to compile.
 _WORTHWHILE = 100_000
@@ -25,20 +25,17 @@ _FINEST = 1e-12
 
 def resolve(scene: Scene) -> Job:
     """The job of ``scene``. Raises :class:`InputError` if its method does not suit it."""
-    return Job(scene, _route(scene))
-
-
-def _route(scene: Scene) -> Route:
+    route = DIRECT
     # Local imports: scenes without an atlas do without its modules.
     if scene.analysis.continuous:
         from drivetrain_jax.runs.atlas_file import AtlasRoute
 
-        return AtlasRoute()
-    if choice := choose_atlas(scene):
+        route = AtlasRoute()
+    elif choice := choose_atlas(scene):
         from drivetrain_jax.runs.through_atlas import ThroughAtlas
 
-        return ThroughAtlas(*choice)
-    return DIRECT
+        route = ThroughAtlas(*choice)
+    return Job(scene, route)
 
 
 def choose_atlas(scene: Scene) -> tuple[Ranges, int | None] | None:

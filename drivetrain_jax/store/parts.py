@@ -35,15 +35,12 @@ class PartsFolder:
         # All links to a file share one folder, and so one lock.
         out = behind_link(out)
         self.out, self.path = out, out.parent / f"{out.name}.parts"
+        # The name by which workers find the folder.
+        self.place = os.path.abspath(self.path)
         # Path at which the result grows.
         self.result = self.path / "result.tmp"
         self._plan = self.path / "plan.json"
         self._lock: FileLock | None = None
-
-    @property
-    def place(self) -> str:
-        """The folder, under the name by which workers find it."""
-        return os.path.abspath(self.path)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return PartsFolder, (Path(os.path.abspath(self.out)),)
@@ -92,33 +89,32 @@ class PartsFolder:
         Raises :class:`InputError` if another run has locked the folder, or if it cannot be created or locked.
         """
         file = self.path / "lock"
-        while True:
-            self._make()
+        while self._lock is None:
+            try:
+                self.path.mkdir(exist_ok=True)
+                sync_folder(self.path.parent)
+            except OSError as error:
+                # A full disk may have space later.
+                if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                    raise
+                raise self._error(f"{error.strerror}; expected a path in a writable folder") from None
             lock = FileLock(file, timeout=0)
             try:
                 lock.acquire()
             except Timeout:
-                raise InputError(f"out = {str(self.path)!r}: another run is working on it; wait or stop it") from None
+                raise self._error("another run is working on it; wait or stop it") from None
             except FileNotFoundError:
                 continue
             except PermissionError:
-                raise InputError(f"out = {str(self.path)!r}: not writable; move it away") from None
+                raise self._error("not writable; move it away") from None
             # Another run may have removed the folder between mkdir and lock.
             if os.path.exists(file):
                 self._lock = lock
-                return
-            lock.release()
+            else:
+                lock.release()
 
-    def _make(self) -> None:
-        try:
-            self.path.mkdir(exist_ok=True)
-            sync_folder(self.path.parent)
-        except OSError as error:
-            # A full disk may have space later.
-            if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise
-            text = f"out = {str(self.path)!r}: {error.strerror}; expected a path in a writable folder"
-            raise InputError(text) from None
+    def _error(self, text: str) -> InputError:
+        return InputError(f"out = {str(self.path)!r}: {text}")
 
     def start(self, plan: Mapping[str, Any]) -> None:
         """Delete all blocks and start those of ``plan``."""
