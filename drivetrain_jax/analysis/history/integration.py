@@ -15,71 +15,6 @@ from drivetrain_jax._quantities import Parameter
 from drivetrain_jax.analysis._base import Request
 from drivetrain_jax.systems import Flow
 
-# Steps of diffrax up to a given fraction of the interval, with a record of the largest state.
-
-
-# State of the step-size controller, largest component so far, and longest step.
-_State = tuple[Any, Array, Array]
-
-
-class WatchedSteps(diffrax.AbstractAdaptiveStepSizeController[_State, None]):
-    """The steps of ``controller``, at most the fraction ``part`` of the interval ``length``.
-
-    A first step of more than half of the longest step is multiplied by ``part``. With ``part`` 1 the steps are those of
-    ``controller``. A smaller ``part`` changes the steps even if one or two of them cover the whole interval, where a change
-    of the tolerance has no effect.
-    """
-
-    controller: diffrax.PIDController
-    part: Any
-    length: Any
-
-    @property
-    def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """rtol of the controller."""
-        return self.controller.rtol
-
-    @property
-    def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """atol of the controller."""
-        return self.controller.atol
-
-    @property
-    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Norm of the controller."""
-        return self.controller.norm
-
-    def wrap(self, direction: Any) -> WatchedSteps:
-        """Itself: the steps go forwards."""
-        return self
-
-    def init(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: None, args: Any, func: Any, error_order: Any
-    ) -> tuple[Any, _State]:
-        """End of the first step, and the state."""
-        end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        longest, step = self.part * self.length, end - t0
-        # If the first step is short, it or later steps depend on the tolerance: shortening it would only add cost.
-        step = jnp.where(step < longest / 2, step, jnp.minimum(self.part * step, longest))
-        return t0 + step, (state, jnp.max(jnp.abs(y0)), longest)
-
-    def adapt_step_size(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any, error_order: Any, state: _State
-    ) -> tuple:
-        """Flag if the step is accepted, the next step, flag if it begins at a jump, the state, and the result."""
-        inner, largest, longest = state
-        kept, start, end, jumped, inner, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, inner
-        )
-        met = jnp.where(kept, jnp.maximum(largest, jnp.max(jnp.abs(y1_candidate))), largest)
-        return kept, start, jnp.minimum(end, start + longest), jumped, (inner, met, longest), result
-
-
-def largest_met(solution: diffrax.Solution) -> Array:
-    """Largest modulus of a component at the ends of the steps; ``solution`` must have ``controller_state=True``."""
-    return solution.controller_state[1]  # pyright: ignore[reportOptionalSubscript]
-
-
 NUM = Parameter(
     "num", "1", "number of equally spaced times from 0 to stop", default=1001, lower=2, upper=1e7, integer=True
 )
@@ -87,9 +22,9 @@ NUM = Parameter(
 # Tolerance of the steps over rtol, ratio of the coarser run, and tightest tolerance. Tight, because errors of steps
 # accumulate over the memory of the damped motion.
 _SHARPNESS, _COARSER, _SHARPEST = 0.01, 10.0, 1e-15
-# Ratio of the longest steps of the accurate run to those of the coarser run, which are one segment at first: with one step
-# per segment both runs would agree and show no error. Every further attempt shortens both by this ratio.
-_PART = 0.5
+# Ratio of the longest steps of the accurate run to those of the coarser run, which are one segment at first: with one step,
+# or two, per segment both runs could agree and show no error. Every further attempt shortens both by this ratio.
+_PART = 1 / 3
 # Further attempts: fraction of rtol as next target, tightest tolerance, number of attempts.
 _RESERVE, _SHARPEST_AGAIN, _MOST_ATTEMPTS = 0.3, 1e-14, 3
 # Most steps of one segment (at most a strobe).
@@ -104,8 +39,8 @@ _STEPS_TO_TIME, _REPEATABLE = 100, 0.1
 
 
 class _Place(NamedTuple):
-    """State of the integration: time ``(strobe + fraction) * period``, state, largest component so far, number of steps,
-    and a flag of success."""
+    """State of the integration: time ``(strobe + fraction) * period``, state, largest component at the end of a segment so
+    far, number of steps, and a flag of success."""
 
     strobe: Array
     fraction: Array
@@ -179,14 +114,11 @@ def has_finite_start(flow: Flow) -> Array:
 
 
 def _segment(
-    flow: Flow,
-    solver: diffrax.AbstractSolver,
-    controller: diffrax.PIDController,
-    part: Array,
-    place: _Place,
-    end: Array,
-) -> tuple[Array, Array, Array, Array]:
-    """State at the fraction ``end`` of the strobe, largest component, number of steps, and a flag of success."""
+    flow: Flow, solver: diffrax.AbstractSolver, tolerance: Any, part: Any, place: _Place, end: Array
+) -> tuple[Array, Array, Array]:
+    """State at the fraction ``end`` of the strobe, number of steps, and a flag of success."""
+    atol = jnp.maximum(tolerance * size_of(flow), 1e-300)
+    longest = part * (end - place.fraction)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda s, y, _: flow.period * flow.vector(place.strobe, s, y)),
         solver,
@@ -194,14 +126,14 @@ def _segment(
         t1=end,
         dt0=None,
         y0=place.y,
-        stepsize_controller=WatchedSteps(controller, part, end - place.fraction),  # pyright: ignore[reportCallIssue]
-        saveat=diffrax.SaveAt(t1=True, controller_state=True),
+        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=atol, dtmax=longest),
+        saveat=diffrax.SaveAt(t1=True),
         adjoint=diffrax.ForwardMode(),
         max_steps=_MAX_SEGMENT,
         throw=False,
     )
     well = solution.result == diffrax.RESULTS.successful
-    return solution.ys[0], largest_met(solution), solution.stats["num_steps"], well  # pyright: ignore[reportOptionalSubscript]
+    return solution.ys[0], solution.stats["num_steps"], well  # pyright: ignore[reportOptionalSubscript]
 
 
 def _ahead(place: _Place, target: tuple[Array, Array]) -> Array:
@@ -224,7 +156,6 @@ def trajectory(
     States after a failure, beyond the limits or without ``begins`` are NaN. ``tolerance`` bounds the error of a step
     relative to the state and to :func:`size_of`; ``part`` its length relative to its segment, which is at most a strobe.
     """
-    controller = diffrax.PIDController(rtol=tolerance, atol=jnp.maximum(tolerance * size_of(flow), 1e-300))
     turns = times / flow.period
     few = turns[-1] <= limits.strobes
     strobes = jnp.where(few, jnp.floor(turns), 0.0).astype(jnp.int64)
@@ -234,14 +165,15 @@ def trajectory(
         last = place.strobe == strobe
         # In a batch the loop runs until the last lane is done: finished or failed lanes integrate over an empty span.
         end = jnp.where(_ahead(place, target), jnp.where(last, fraction, 1.0), place.fraction)
-        y, reached, steps, well = _segment(flow, solver, controller, part, place, end)
+        y, steps, well = _segment(flow, solver, tolerance, part, place, end)
         total = place.steps + steps
         healthy = place.healthy & well & (total <= limits.steps) & jnp.all(jnp.isfinite(y))
+        y = jnp.where(healthy, y, place.y)
         return _Place(
             jnp.where(last, strobe, place.strobe + 1),
             jnp.where(last, fraction, 0.0),
-            jnp.where(healthy, y, place.y),
-            jnp.maximum(place.reached, reached),
+            y,
+            jnp.maximum(place.reached, jnp.max(jnp.abs(y))),
             total,
             healthy,
         )
