@@ -15,6 +15,7 @@ from xarray.core import indexing
 from drivetrain_jax._errors import InputError
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
     from drivetrain_jax.explore import Page
@@ -39,6 +40,18 @@ class DrivetrainAccessor:
         from drivetrain_jax.datasets.figure import plot
 
         return plot(self._dataset, *others, **options)
+
+    def table(self) -> pd.DataFrame:
+        """The result as a table of pandas, a row for each point, or each sample of a point (time, position along a shaft).
+
+        Columns are swept parameters, physical data along them, and results; entries of a short dimension have columns of
+        their own (``critical_speed_1``), where ``to_dataframe`` has rows. Units are in the header, ``Omega [rad/s]``; codes
+        are words.
+        """
+        # Local import: it takes a third of a second.
+        import pandas as pd
+
+        return pd.DataFrame({name: np.ravel(values) for name, values in _columns(self._dataset)})
 
     def verify(self) -> Report:
         """The report on the rules of the analysis and on the checksums of the file.
@@ -219,26 +232,18 @@ class _Words(BackendArray):
 
 
 def write_csv(source: Path, out: Path) -> int:
-    """Write the result ``source`` as the table ``out`` and return its number of rows.
-
-    A row is a point, or a sample of a point (time, position along a shaft). Columns are swept parameters, physical data
-    along them, and results; entries of a short dimension have columns of their own (``critical_speed_1``). Units are in the
-    header, ``Omega [rad/s]``; codes are words.
+    """Write the result ``source`` as the table ``out``, see :meth:`DrivetrainAccessor.table`; returns its number of rows.
 
     Raises: :class:`~drivetrain_jax.InputError` for an atlas, which is a function.
     """
-    # Local import: it takes a third of a second.
-    import pandas as pd
-
     from drivetrain_jax.store.consolidate import open_result
     from drivetrain_jax.store.files import move_into_place
 
     dataset = open_result(source)
     if dataset.attrs.get("analysis") == "atlas" or "outcome" not in dataset:
         raise InputError(f"file = {str(source)!r}: holds no values on a grid; expected a chart of it, saved as a file")
-    temporary = out.with_name(f"{out.name}.tmp")
+    temporary, table = out.with_name(f"{out.name}.tmp"), dataset.drivetrain.table()
     try:
-        table = pd.DataFrame({name: np.ravel(values) for name, values in _columns(dataset)})
         table.to_csv(temporary, index=False, chunksize=_ROWS)
         move_into_place(temporary, out)
     finally:

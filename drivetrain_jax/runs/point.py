@@ -377,7 +377,7 @@ class OrderCrossings:
         return [f"  speed of the {self.orders.shaft} at which an order meets the mode", *aligned([head, *modes])]
 
     def sentence(self, values: Mapping[str, Any]) -> str:
-        """The speeds within the operating range, or else the first ones; and the modes of ``values`` too near to that range."""
+        """The speeds within the operating range, else the first ones; and the modes of ``values`` too near to that range."""
         if not self.operating:
             (name, column), *_ = self.columns.items()
             met = [f"mode {k + 1} at {column[k]:.6g} rpm" for k in np.flatnonzero(np.isfinite(column))]

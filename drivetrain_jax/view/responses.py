@@ -43,7 +43,7 @@ _MARK_STYLE = {"markeredgecolor": "#111111", "markersize": 3, "fillstyle": "none
 _SOLID, _DASHED, _JUMPED, _BACKBONE = "-", (0, (2, 1)), ":", (0, (6, 2, 1, 2))
 _UNSTABLE_ENTRY = Line2D([], [], color=FRAME_GREY, linestyle=_DASHED, label="unstable")
 _JUMP_ENTRY = Line2D([], [], color=FRAME_GREY, linestyle=_JUMPED, linewidth=0.7, label="jump of a sweep")
-_SPECIAL = {"fold_frequency": ("fold", (0, (1, 2))), "doubling_frequency": ("period doubling", (0, (4, 2)))}
+_SPECIAL = {"fold_frequency": ("fold", (0, (8, 2, 1, 2))), "doubling_frequency": ("period doubling", (0, (4, 2)))}
 _STABLE, _UNSTABLE = range(2)
 # A step of a sweep is a jump if it exceeds these ratios to the range of the values and to the neighbouring steps.
 _JUMP, _STEEPER = 0.04, 6.0
@@ -239,13 +239,22 @@ def _draw_special(sheet: Sheet, axes: Axes, result: xr.Dataset, path: str) -> No
     if bool(wandering.notnull().any()):
         dots: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 2.0, "label": "not periodic"}
         sheet.add(*axes.plot(x, wandering, **dots, color=FLAG_COLOURS["non_periodic"])[:1])
-    _draw_bifurcations(sheet, axes, result)
+    _draw_bifurcations(sheet, axes, result, path)
 
 
-def _draw_bifurcations(sheet: Sheet, axes: Axes, result: xr.Dataset) -> None:
-    """Draw folds and period doublings as vertical lines."""
+def _draw_bifurcations(sheet: Sheet, axes: Axes, result: xr.Dataset, path: str) -> None:
+    """Draw folds and period doublings within the values of ``path`` as vertical lines."""
+    x = result[path]
     for key, (label, dashes) in _SPECIAL.items():
-        for value in np.unique(result[key].values[np.isfinite(result[key].values)]) if key in result else ():
+        if key not in result:
+            continue
+        # Folds are values of the parameter that follows from an axis of physical data.
+        units = units_of(result[key])
+        follow = (c for c in result.coords.values() if c.dims == (path,) and c.name not in (path, "point"))
+        parameter = next((c for c in follow if size(units_of(c), units)), x)
+        found = np.unique(result[key].values) / (size(units_of(parameter), units) or 1.0)
+        inside = found[(found >= parameter.values.min()) & (found <= parameter.values.max())]
+        for value in np.interp(inside, *np.sort([parameter.values, x.values], axis=1)):
             style = {"color": FRAME_GREY, "linewidth": 0.8, "linestyle": dashes, "label": label, "zorder": 1}
             sheet.add(axes.axvline(value, **style))
 
@@ -269,7 +278,7 @@ def _orbits(dataset: xr.Dataset, path: str) -> Figure:
             style = {"color": colour, "markerfacecolor": face, "markersize": 2.4, "markeredgewidth": 0.7}
             label = f"{label}, {charts.entry_name(displaced, name)}"
             sheet.add(*(axes.plot(x[place], values[place, branch], "o", **style, label=label) if place.size else ()))
-        _draw_bifurcations(sheet, axes, dataset)
+        _draw_bifurcations(sheet, axes, dataset, path)
         axes.set_ylim(bottom=0.0)
     charts.fit_panels(sheet, dataset, path)
     sheet.label(axis_label(dataset[path]), variable_label(amplitude))

@@ -29,6 +29,7 @@ def test_every_number_is_in_its_column(file):
         np.testing.assert_array_equal(found[f"critical_speed_{mode} [rpm]"], values.ravel())
     np.testing.assert_array_equal(found["k_D [N/m]"], np.tile(dataset.k_D.values, 2))
     assert (found.outcome == "success").all()
+    assert list(dataset.drivetrain.table().columns) == list(found.columns)
 
 
 @pytest.mark.full

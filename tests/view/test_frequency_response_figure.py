@@ -166,3 +166,16 @@ def test_regimes_of_both_sweeps_are_strips_and_half_the_backlash_a_line():
     strips = [each.get_array().ravel().tolist() for each in axes.collections if isinstance(each, QuadMesh)]
     assert strips == [codes[:, 1].tolist(), codes[:, 0].tolist()]
     assert [item.get_ydata()[0] for item in axes.lines if item.get_label() == "half the backlash"] == [0.3]
+
+
+def test_folds_stand_at_their_speed_along_an_axis_of_physical_data():
+    """Two excitations a turn: folds at 0.8 and 1.2 rad/s are those of 0.4 and 0.6 rad/s of the shaft; 9 rad/s is outside."""
+    about = {"units": "rpm", "long_name": "speed"}
+    swept = line().rename(omega="speed").assign_coords(speed=("speed", OMEGA / 2 * 30 / np.pi, about))
+    swept = swept.assign_coords(omega=("speed", OMEGA, {"units": "rad/s"})).assign_attrs(roles='{"speed": "speed"}')
+    folds = np.tile([0.8, 1.2, 9.0, np.nan], (len(OMEGA), 1))
+    figure = plot(swept.assign(fold_frequency=variable(("speed", "fold"), folds, "rad/s")))
+    drawn = [item.get_xdata()[0] for item in figure.axes[0].lines if item.get_label() == "fold"]
+    np.testing.assert_allclose(drawn, np.array([0.4, 0.6]) * 30 / np.pi, rtol=1e-12)
+    outside = swept.assign(fold_frequency=variable(("speed", "fold"), folds[:, 2:], "rad/s"))
+    assert "fold" not in [text.get_text() for text in plot(outside).legends[0].get_texts()]
