@@ -299,6 +299,8 @@ def test_any_function_is_swept_resumed_and_refused(tmp_path):
     before = out.stat().st_mtime_ns
     dt.sweep(one(1.0), pytree, over=over, out=out)
     assert out.stat().st_mtime_ns == before
+    even = {"a": {"start": -1.0, "stop": 9.0, "num": 3}, "b": {"values": [1.0, 3.0]}}
+    assert dt.sweep(one(1.0), pytree, over=even).equals(found)
     remedy = "differs?; --fresh replaces it \\(fresh=True in Python\\)"
     with pytest.raises(
         dt.InputError, match=f"another scene or version: the function, an option or a fixed value {remedy}"

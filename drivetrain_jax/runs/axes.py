@@ -100,12 +100,10 @@ def axis_table(parameter: Parameter, name: str, keys: Any, where: str, *, keep: 
     split = _units.split(texts[0]) if keep and texts else None
     described = in_unit(parameter, split[1]) if split else parameter
 
+    size = 1 if described is parameter else _units.factor(parameter.units, described.units)
+
     def plain(value: Any) -> Any:
-        if isinstance(value, str):
-            return _units.number(value, described.units)
-        if value is None or described is parameter:
-            return value
-        return value * _units.factor(parameter.units, described.units)
+        return _units.number(value, described.units) if isinstance(value, str) else value and value * size
 
     values = None if table.values is None else [plain(value) for value in table.values]
     return msgspec.structs.replace(table, start=plain(table.start), stop=plain(table.stop), values=values), described

@@ -54,16 +54,9 @@ class Kernel:
         if count < self.chunk:
             columns = {name: np.pad(values, (0, self.chunk - count), mode="edge") for name, values in columns.items()}
         with self.turn:
-            results = {
-                name: np.asarray(value)
-                for name, value in self.compiled(columns, _arrays(numbers), np.int64(effort)).items()
-            }
-        arrays = {}
-        for variable in self.variables:
-            values = results[variable.name]
-            values = np.moveaxis(values, -1, 0)
-            arrays[variable.name] = np.ascontiguousarray(values[:count], dtype=variable.dtype)
-        return arrays
+            results = self.compiled(columns, _arrays(numbers), np.int64(effort))
+            results = {name: np.moveaxis(np.asarray(value), -1, 0)[:count] for name, value in results.items()}
+        return {v.name: np.ascontiguousarray(results[v.name], dtype=v.dtype) for v in self.variables}
 
 
 def _batch(

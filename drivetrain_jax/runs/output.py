@@ -55,7 +55,17 @@ class Output:
     def __init__(self, out: Path, job: Job, store: str | None = None) -> None:
         self.out, self.job = behind_link(out.expanduser()), job
         self.parts = PartsFolder(self.out)
-        self._check_path()
+        folder, parts, ending = self.out.parent, self.parts.path, self.out.suffix.lower()
+        guess = did_you_mean(ending, (".zarr",)) if ending != ".zarr" else ""
+        if guess or ending in _FOREIGN:
+            raise self.error(f"a result is netCDF or Zarr; expected a name that ends in .nc or .zarr{guess}")
+        try:
+            if not folder.is_dir():
+                raise self.error(f"the folder {str(folder)!r} does not exist; expected a file in an existing folder")
+            if parts.exists() and not (parts.is_dir() and os.access(parts, os.R_OK | os.X_OK)):
+                raise self.error(f"{str(parts)!r} is no readable folder; move it away")
+        except OSError as error:
+            raise self.error(f"{error.strerror} (with '.parts'); expected a shorter name") from None
         # The plan of unfinished work; empty without any.
         self.unfinished = self.parts.plan()
         is_store = zarr_store.is_store(self.out)
@@ -71,19 +81,6 @@ class Output:
     def error(self, text: str) -> InputError:
         """An error about the output."""
         return InputError(f"out = {str(self.out)!r}: {text}")
-
-    def _check_path(self) -> None:
-        folder, parts, ending = self.out.parent, self.parts.path, self.out.suffix.lower()
-        guess = did_you_mean(ending, (".zarr",)) if ending != ".zarr" else ""
-        if guess or ending in _FOREIGN:
-            raise self.error(f"a result is netCDF or Zarr; expected a name that ends in .nc or .zarr{guess}")
-        try:
-            if not folder.is_dir():
-                raise self.error(f"the folder {str(folder)!r} does not exist; expected a file in an existing folder")
-            if parts.exists() and not (parts.is_dir() and os.access(parts, os.R_OK | os.X_OK)):
-                raise self.error(f"{str(parts)!r} is no readable folder; move it away")
-        except OSError as error:
-            raise self.error(f"{error.strerror} (with '.parts'); expected a shorter name") from None
 
     def _digest(self) -> str | None:
         if not self.out.exists():

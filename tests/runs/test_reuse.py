@@ -169,6 +169,8 @@ def test_lists_of_points(tmp_path):
     large = small | {"points": {"b": [1.0, 5.0, 2.0, 1.0], "a": [3.0, 1.0, 8.0, 1.0]}}
     assert counts(run_to_file(large, tmp_path / "r.nc")) == (4, 1, 3)
     agree(tmp_path / "r.nc", large)
+    rounded = small | {"points": {"a": [np.nextafter(3.0, 4.0), np.nextafter(8.0, 9.0)], "b": [1.0, 1.0]}}
+    assert counts(run_to_file(rounded, tmp_path / "rounded.nc", reuse=[tmp_path / "r.nc"])) == (2, 1, 1)
     grid = scene({"a": [1.0, 2.0], "b": [1.0, 5.0]})
     run_to_file(grid, tmp_path / "grid.nc")
     some = small | {"points": {"a": [1.0, 2.5], "b": [5.0, 5.0]}}
