@@ -45,7 +45,9 @@ def create(path: Path, template: Labelled, shards: Shards) -> None:
         n: replace(c, values=c.values.astype(object)) if c.values.dtype.kind == "U" else c
         for n, c in template.coords.items()
     }
-    replace(template, coords=coords, data={}).to_dataset().to_zarr(path, mode="w", zarr_format=3, consolidated=False)
+    checked = {name: {"compressors": (zarr.codecs.Crc32cCodec(),)} for name in coords}
+    dataset = replace(template, coords=coords, data={}).to_dataset()
+    dataset.to_zarr(path, mode="w", zarr_format=3, consolidated=False, encoding=checked)
     root = _root(path, "r+")
     for name, entry in template.data.items():
         inner = entry.values.shape[len(shards.shape) :]

@@ -225,6 +225,11 @@ def test_a_changed_coordinate_is_found(grid_scene, tmp_path):
 
     zarr.open_group(path, mode="r+")["a"][3] = 0.7
     assert "attributes of the store: damaged" in verify(path).problem
+    # Other readers see a damaged byte by the checksum of Zarr.
+    chunk = path / "a" / "c" / "0"
+    chunk.write_bytes(bytes([chunk.read_bytes()[0] ^ 1]) + chunk.read_bytes()[1:])
+    with pytest.raises(ValueError, match="checksum"):
+        zarr.open_group(path)["a"][:]
 
 
 def test_points_that_no_solver_can_compute_are_counted(tmp_path):
