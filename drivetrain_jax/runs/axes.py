@@ -283,11 +283,12 @@ class Grid:
         return {name: values[name] for name in self.parameters if name in values}
 
     def arrays(self, points: np.ndarray) -> dict[str, Any]:
-        """Like ``bind`` at ``points``, with every number (and entry of a list) as an array of the shape of ``points``."""
+        """Like ``bind`` at ``points``, with every number as an array of the shape of ``points``.
+
+        Fixed entries of lists stay numbers: kernels have them as constants, too.
+        """
         return {name: self._spread(value, points.shape) for name, value in self.bind(self.columns(points)).items()}
 
     def _spread(self, value: Any, shape: tuple[int, ...]) -> Any:
-        if isinstance(value, tuple):
-            return tuple(self._spread(entry, shape) for entry in value)
-        whole = isinstance(value, str) or (self.path is not None and value is self.path.values)
+        whole = isinstance(value, (str, tuple)) or (self.path is not None and value is self.path.values)
         return value if whole else np.broadcast_to(value, shape)

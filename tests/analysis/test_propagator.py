@@ -19,6 +19,7 @@ from drivetrain_jax.analysis.numerics.collocation import first_order, gauss, pan
 from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last, traced_once
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
 from drivetrain_jax.systems import LinearPeriodic
+from tests.quick_jit import quick_jit
 from tests.sizes import full_after
 
 SPAN = 2.0
@@ -140,6 +141,24 @@ def test_derivative_of_a_panel(scheme):
             value([e + sign * step * direction * (k == t) for k, e in enumerate(coefficients)]) for sign in (1, -1)
         )
         assert float(jnp.sum(gradient * direction)) == pytest.approx(float(ahead - behind) / (2 * step), rel=1e-8)
+
+
+@pytest.mark.parametrize("d", [3, 7])
+def test_chains_are_eliminated_unknown_by_unknown(d):
+    """Up to 12 radians in a panel, against a solution of all equations with exchanged rows, unrolled and as a loop."""
+    rng, scheme, s = np.random.default_rng(2), second_order(gauss(STAGES)), STAGES
+    slopes = rng.uniform(0.5, 1.5, (3, d, s))
+    couplings = [np.stack([np.diag(x[:, t]) @ (np.eye(d) - np.eye(d, k=-1)) for t in range(s)]) for x in slopes]
+    stiff = np.einsum("tki,tkj->tij", couplings[0], couplings[1])
+    coefficients = [-0.3 * couplings[2], -stiff * 144 / np.linalg.norm(stiff[0], 2)]
+    found = quick_jit(partial(panel, scheme, chain=True))([jnp.asarray(e)[..., None] for e in coefficients])[..., 0]
+    m, right = np.eye(s * d).reshape(s, d, s, d), 0
+    for weights, factors, e in zip(scheme.inner, np.swapaxes(scheme.right, 0, 1), coefficients, strict=True):
+        m = m - np.einsum("tu,tij->tiuj", weights, e)
+        right = right + np.einsum("pt,tij->tipj", factors, e)
+    x = np.linalg.solve(m.reshape(s * d, -1), np.reshape(right, (s * d, -1))).reshape(s, d, -1)
+    expected = np.kron(scheme.start, np.eye(d)) + np.einsum("pt,tic->pic", scheme.left, x).reshape(2 * d, -1)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
 @pytest.mark.full

@@ -23,7 +23,7 @@ from drivetrain_jax.analysis.floquet.multipliers import (
     root_scale,
 )
 from drivetrain_jax.analysis.numerics.kernels import stored
-from drivetrain_jax.analysis.numerics.linear_algebra import matmul, square_sum
+from drivetrain_jax.analysis.numerics.linear_algebra import product, square_sum
 
 # Rounding of the entries of A, in units of the last place. A search for the worst points showed that half is too little.
 _ENTRIES = 16
@@ -83,7 +83,7 @@ def assemble(ends: Array | None, phi: Array) -> Array:
     if ends is None:
         return phi
     start, end = ends.reshape(*ends.shape[:3], *(ends.shape[3:] or (1,) * (phi.ndim - 2)))
-    return matmul(start, matmul(jnp.swapaxes(phi, 0, 1), matmul(end, phi)))
+    return product(start, product(jnp.swapaxes(phi, 0, 1), product(end, phi)))
 
 
 def _balance(size: Array) -> Array:

@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, matmul, square_sum
+from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, matmul, product, square_sum
 
 if TYPE_CHECKING:
     from drivetrain_jax.analysis.floquet.propagator import Factored
@@ -59,7 +59,7 @@ def characteristic_polynomial(z: Array) -> tuple[Array, Array]:
         a = -sum(power[i, i] for i in range(n)) / k
         following = power + a * unit
         slopes = jnp.where(number == k + 1, jnp.sqrt(square_sum(following) / n), slopes)
-        return matmul(z, following), jnp.where(number == k, a, coefficients), slopes
+        return product(z, following), jnp.where(number == k, a, coefficients), slopes
 
     start = z, jnp.zeros_like(z[0]), jnp.ones_like(z[0])
     return jax.lax.fori_loop(1, n + 1, onward, start)[1:]

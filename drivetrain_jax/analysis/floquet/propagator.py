@@ -307,7 +307,8 @@ def _by_blocks(compute: Callable[..., Any], fixed: Constants, arrays: LinearPeri
 
         return jax.lax.map(block, packed)
 
-    in_one = all(march.suits and march.d <= _SMALL and march.size <= _FEW for march in marches)
+    small = [(march.chain and compute is _agreeing) or (march.d <= _SMALL and march.size <= _FEW) for march in marches]
+    in_one = all(small) and all(march.suits for march in marches)
     mark = in_one_kernel if in_one else lambda function: function
     return jax.tree.map(lambda x: blocks_joined(x, lanes), mark(all_blocks)(shared, packed))
 
@@ -494,6 +495,10 @@ class Panels:
         times = jnp.zeros((STAGES, 1))
         split = staged(system.entries, *jax.eval_shape(system.basis, times))
         self.moving = split.moving
+        # Only neighbours are coupled, as in a chain of more than two.
+        places = jax.eval_shape(lambda *at: system.entries(*at), *jax.eval_shape(system.basis, times))
+        own = [(i - self.d, j % self.d) for i, j in places if i >= self.d]
+        self.chain = unit is not None and self.d > 2 and all(abs(i - j) < 2 for i, j in own)
         self.suits = suits_one_kernel(lambda t: system.rows(*system.basis(t)), times)
         self.fixed = Fixed(split.fixed, jnp.asarray(system.span, float), jnp.asarray(1.0 if unit is None else unit))
 
@@ -501,7 +506,7 @@ class Panels:
         """The propagator of one of ``count`` panels, ``(n, n, lanes)``."""
         h = fixed.span / count
         rows = jnp.where((np.arange(self.size) < self.d)[:, None], 1.0, h * fixed.unit)
-        return panel(self.scheme, self.coefficients(fixed, h, number)) * rows / rows[:, None]
+        return panel(self.scheme, self.coefficients(fixed, h, number), self.chain) * rows / rows[:, None]
 
     def through(self, fixed: Fixed, state: _State, count: Array, records: Array) -> _State:
         """The state after ``count`` panels; with ``records`` its covariance and stiffness too."""
@@ -536,7 +541,7 @@ class Panels:
 
     def _onward(self, fixed: Fixed, h: Array, records: Array, number: Array, state: _State) -> _State:
         coefficients = self.coefficients(fixed, h, number)
-        moved = panel(self.scheme, coefficients)
+        moved = panel(self.scheme, coefficients, self.chain)
         matrix = stored(matmul)(moved, state.matrix)
         factor = stored(_factor)(matrix)
         matrix = stored(jnp.multiply)(matrix, factor)

@@ -55,7 +55,12 @@ def has_closed_form(z: Array) -> bool:
 
 def radius_by_eigenvalues(spectrum: Spectrum, error: Array) -> Radius:
     """Spectral radius and bound; ``error`` bounds the errors of the coefficients a_k in units of rho^k."""
-    return over_first(jnp.maximum, jnp.hypot(*spectrum)), spectral_radius_bound(*spectrum, error)
+
+    def radius(values: tuple[Array, ...], _: int) -> Radius:
+        return over_first(jnp.maximum, jnp.hypot(*values[:2])), spectral_radius_bound(*values)
+
+    values = *spectrum, error
+    return in_blocks(radius, values, len(error), _BLOCK, in_one_kernel) if error.ndim == 1 else radius(values, 1)
 
 
 def radius_in_closed_form(

@@ -25,6 +25,7 @@ from jax import Array
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, stored, suits_one_kernel
+from drivetrain_jax.analysis.numerics.linear_algebra import matmul
 from drivetrain_jax.systems import LinearPeriodic
 
 
@@ -188,12 +189,77 @@ def panel_propagator(scheme: Scheme, elimination: Factors, d: int) -> Array:
     return stored(total)(elimination.left, elimination.right)
 
 
-def panel(scheme: Scheme, coefficients: Sequence[Array]) -> Array:
+# Unknowns of a node up to which the loop over them is unrolled.
+_UNROLLED = 6
+
+
+def chain_propagator(scheme: Scheme, coefficients: Sequence[Array]) -> Array:
+    """P of one panel, ``(n, n, lanes)``, of a chain: ``E_t`` couple each unknown with its neighbours alone.
+
+    M is block tridiagonal if the values of an unknown at all nodes are neighbours. Its blocks are ``(s, s)``, and their
+    elimination needs no exchange of rows either, because the rest of the chain held fixed is a system of the same kind.
+    """
+    s, d = coefficients[0].shape[:2]
+    lanes = max(e.shape[-1] for e in coefficients)
+    coefficients = [jnp.broadcast_to(e, (*e.shape[:-1], lanes)) for e in coefficients]
+    columns = len(scheme.right) * d
+
+    def block(entries: Array) -> Array:
+        return sum(weights[..., None] * e[:, None] for weights, e in zip(scheme.inner, entries, strict=True))  # pyright: ignore[reportReturnType]
+
+    def beside(step: int) -> Array:
+        places = [(i, min(max(i + step, 0), d - 1)) for i in range(d)]
+        return jnp.stack([e[:, i, j] for i, j in places for e in coefficients]).reshape(d, -1, s, lanes)
+
+    def rows() -> tuple[Array, ...]:
+        right = [sum(x[:, None, None, None] * e for x, e in zip(f, coefficients, strict=True)) for f in scheme.right]
+        return beside(-1), beside(0), beside(1), jnp.moveaxis(jnp.concatenate(right, 2), 1, 0)
+
+    def reduced(before: tuple[Array, Array], below: Array, own: Array, right: Array) -> tuple[Array, Array]:
+        left = block(below)
+        return jnp.eye(s)[..., None] - block(own) + matmul(left, before[0]), right + matmul(left, before[1])
+
+    def solved(matrix: Array, above: Array, right: Array) -> tuple[Array, Array]:
+        return -matmul(matrix, block(above)), matmul(matrix, right)
+
+    def forwards(
+        before: tuple[Array, Array], row: tuple[Array, ...]
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        below, own, above, right = row
+        matrix, right = stored(reduced)(before, below, own, right)
+        for k in range(s):
+            matrix = stored(partial(_turned, k))(matrix)
+        now = stored(solved)(matrix, above, right)
+        return now, now
+
+    def change(unknowns: Array) -> Array:
+        return jnp.stack([sum(w * x for w, x in zip(weights, unknowns, strict=True)) for weights in scheme.left])
+
+    def backwards(after: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
+        unknowns = stored(lambda x, y: y - matmul(x, after))(*row)
+        return unknowns, stored(change)(unknowns)
+
+    start = jnp.zeros((s, s, lanes)), jnp.zeros((s, columns, lanes))
+    unroll = d <= _UNROLLED
+    steps = jax.lax.scan(forwards, start, stored(rows)(), unroll=unroll)[1]
+    changes = jax.lax.scan(backwards, start[1], steps, reverse=True, unroll=unroll)[1]
+    whole = jnp.swapaxes(changes, 0, 1).reshape(-1, columns, lanes)
+    return whole + np.kron(scheme.start, np.eye(d))[..., None]
+
+
+def _turned(k: int, matrix: Array) -> Array:
+    """A step of the inversion in place of a matrix ``(s, s, lanes)``: the unknown ``k`` and its row change places."""
+    here = (np.arange(len(matrix)) == k)[:, None]
+    row = jnp.where(here, 1.0, matrix[k]) / matrix[k, k]
+    return jnp.where(here[:, None], row, jnp.where(here, 0.0, matrix) - matrix[:, k, None] * row)
+
+
+def panel(scheme: Scheme, coefficients: Sequence[Array], chain: bool = False) -> Array:
     """P of one panel, ``(n, n, lanes)``, from ``E_t`` ``(s, d, d, lanes)``, with its adjoint as derivative."""
 
     @jax.custom_vjp
     def propagator(coefficients: tuple[Array, ...]) -> Array:
-        return forward(coefficients)[0]
+        return chain_propagator(scheme, coefficients) if chain else forward(coefficients)[0]
 
     def forward(coefficients: tuple[Array, ...]) -> tuple[Array, Factors]:
         elimination = factors(scheme, coefficients)

@@ -3,27 +3,28 @@
 LAPACK calls from concurrent kernels can wait for each other forever in XLA's thread pool (seen with jax 0.10.2 on two
 cores).
 
-``eigenvalues`` reduces to Hessenberg form by Householder reflections and applies the QR iteration with Wilkinson's
-complex shift and deflation from the bottom (Golub & Van Loan, Matrix Computations, 7.4-7.5), which is backward stable. All
-lanes of a batch go through the same sweeps, so the arithmetic vectorises. Complex numbers are pairs of real arrays.
+``eigenvalues`` reduces to Hessenberg form by Householder reflections and applies the QR iteration with Francis' double
+steps (Golub & Van Loan, Matrix Computations, 7.4-7.5), which is backward stable. All lanes of a batch go through the same
+reflections, each in its own block of coupled rows, so the arithmetic vectorises.
 """
 
 from __future__ import annotations
 
-from functools import reduce
+from functools import partial, reduce
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.numerics.kernels import stored
-
-# Real and imaginary part.
-Complex = tuple[Array, ...]
+from drivetrain_jax.analysis.numerics.kernels import any_lane, in_one_kernel, stored
+from drivetrain_jax.analysis.numerics.lanes import in_blocks
 
 _EPS = np.finfo(float).eps
-_MAX_SWEEPS = 40
+# Most double steps of the QR iteration for each row, and lanes of a block: their matrices fit into the innermost cache.
+_MAX_SWEEPS, LANES = 30, 32
+# Rows of a product up to which it may be fused with other operations.
+_FUSED = 8
 # Smallest ratio of a single pivot to the largest entry beside the diagonal (Bunch & Parlett, SIAM J. Numer. Anal. 8, 1971).
 _PIVOT = (1 + 17**0.5) / 8
 
@@ -31,6 +32,11 @@ _PIVOT = (1 + 17**0.5) / 8
 def matmul(a: Array, b: Array) -> Array:
     """Product of matrices whose batch axes trail: ``(n, m, ...)`` times ``(m, k, ...)``."""
     return sum(a[:, j, None] * b[None, j] for j in range(a.shape[1]))  # pyright: ignore[reportReturnType]
+
+
+def product(a: Array, b: Array) -> Array:
+    """:func:`matmul`, with large results stored: XLA shares fusions of more than a product among threads, at a loss."""
+    return stored(matmul)(a, b) if len(a) > _FUSED else matmul(a, b)
 
 
 def square_sum(a: Array) -> Array:
@@ -130,95 +136,121 @@ def spectral_norm(a: Array) -> Array:
     return size * jnp.sqrt(jnp.max(eigenvalues(scaled.T @ scaled)[0]))
 
 
-def _multiply(a: Complex, b: Complex) -> Complex:
-    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
-
-
-def _conjugate_multiply(a: Complex, b: Complex) -> Complex:
-    return a[0] * b[0] + a[1] * b[1], a[0] * b[1] - a[1] * b[0]
-
-
-def _square_root(a: Complex) -> Complex:
-    modulus = jnp.hypot(*a)
-    real = jnp.sqrt((modulus + jnp.abs(a[0])) / 2)
-    other = jnp.where(real > 0, jnp.abs(a[1]) / (2 * jnp.where(real > 0, real, 1.0)), 0.0)
-    right = a[0] >= 0
-    return jnp.where(right, real, other), jnp.where(a[1] < 0, -1.0, 1.0) * jnp.where(right, other, real)
-
-
 def hessenberg(a: Array) -> Array:
     """Upper Hessenberg matrix similar to ``a``, ``(n, n, ...) -> (n, n, ...)``."""
-    n = a.shape[0]
-    for k in range(n - 2):
-        x = a[k + 1 :, k]
-        norm = jnp.sqrt(jnp.sum(x**2, axis=0))
-        v = x.at[0].add(jnp.where(x[0] < 0, -norm, norm))
-        size = jnp.sum(v**2, axis=0)
-        scale = jnp.where(size > 0, 2 / jnp.where(size > 0, size, 1.0), 0.0)
-        a = a.at[k + 1 :].add(-scale * v[:, None] * jnp.sum(v[:, None] * a[k + 1 :], axis=0))
-        a = a.at[:, k + 1 :].add(-scale * jnp.sum(a[:, k + 1 :] * v, axis=1)[:, None] * v)
+    for k in range(len(a) - 2):
+        a = _reflected(a, a[k + 1 :, k], k + 1)
     return a
 
 
-def _pair(a: Complex, b: Complex, c: Complex, d: Complex) -> tuple[Complex, Complex]:
-    """Eigenvalues of [[a, b], [c, d]]; the second one is nearer to ``d``."""
-    half = ((a[0] - d[0]) / 2, (a[1] - d[1]) / 2)
-    off, square = _multiply(b, c), _multiply(half, half)
-    root = _square_root((square[0] + off[0], square[1] + off[1]))
-    sign = jnp.where(half[0] * root[0] + half[1] * root[1] < 0, -1.0, 1.0)
-    far = (half[0] + sign * root[0], half[1] + sign * root[1])
+def _reflected(h: Array, x: Array, first: int) -> Array:
+    """``h`` after a reflection from both sides, which turns ``x`` ``(r, ...)`` in the rows from ``first`` on into its norm.
+
+    None where ``x`` is 0.
+    """
+    v, c = stored(_reflection)(x)
+    rows, columns = stored(partial(_along, first))(h, v, c)
+    return stored(partial(_updated, first))(h, v, rows, columns, stored(partial(_twice, first))(columns, v, c))
+
+
+def _reflection(x: Array) -> tuple[Array, Array]:
+    """``v`` and ``c`` of the reflection ``I - c v v^T``."""
+    size = sum(jnp.abs(y) for y in x)
+    x = x / jnp.where(size > 0, size, 1.0)
+    norm = jnp.sqrt(sum(y**2 for y in x))
+    v = jnp.concatenate([(x[0] + jnp.where(x[0] < 0, -norm, norm))[None], x[1:]])
+    square = sum(y**2 for y in v)
+    return v, jnp.where(square > 0, 2 / jnp.where(square > 0, square, 1.0), 0.0)
+
+
+def _along(first: int, h: Array, v: Array, c: Array) -> tuple[Array, Array]:
+    """``c v^T h`` and ``c h v``."""
+    return c * sum(x * h[first + i] for i, x in enumerate(v)), c * sum(x * h[:, first + i] for i, x in enumerate(v))
+
+
+def _twice(first: int, columns: Array, v: Array, c: Array) -> Array:
+    return c * sum(x * columns[first + i] for i, x in enumerate(v))
+
+
+def _updated(first: int, h: Array, v: Array, rows: Array, columns: Array, twice: Array) -> Array:
+    zero = jnp.zeros_like(twice)
+    v = jnp.stack([*[zero] * first, *v, *[zero] * (len(h) - first - len(v))])
+    return h - v[:, None] * (rows - twice * v) - columns[:, None] * v
+
+
+def _pair(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array, Array, Array]:
+    """Eigenvalues of [[a, b], [c, d]]: both real parts, then both imaginary parts."""
+    half, product = (a - d) / 2, b * c
+    square = half**2 + product
+    root = jnp.sqrt(jnp.abs(square))
+    far = half + jnp.where(half < 0, -root, root)
     # d - bc/far, because d + half - root would cancel.
-    size = far[0] ** 2 + far[1] ** 2
-    quotient = tuple(x / jnp.where(size > 0, size, 1.0) for x in _conjugate_multiply(far, off))
-    return (d[0] + far[0], d[1] + far[1]), (d[0] - quotient[0], d[1] - quotient[1])
+    near = d - product / jnp.where(far == 0, 1.0, far)
+    real, turn = square >= 0, jnp.where(square >= 0, 0.0, root)
+    return jnp.where(real, d + far, d + half), jnp.where(real, near, d + half), turn, -turn
 
 
-def _entry(h: Complex, i: int, j: int) -> Complex:
-    return h[0][i, j], h[1][i, j]
+def _coupled(h: Array) -> list[Array]:
+    """True for each entry below the diagonal that is not negligible."""
+    size = jnp.abs(h)
+    return [size[i + 1, i] > _EPS * (size[i, i] + size[i + 1, i + 1]) for i in range(len(h) - 1)]
 
 
-def _add_to_diagonal(h: Complex, shift: Complex, active: Array) -> Complex:
-    eye = (jnp.eye(len(active)) * active).reshape(*h[0].shape[:2], *(1,) * (h[0].ndim - 2))
-    return h[0] + eye * shift[0], h[1] + eye * shift[1]
+def _windows(h: Array) -> tuple[Array, Array]:
+    """First and last row of the lowest block of more than two coupled rows; 0 and 0 if there is none."""
+    start = first = last = jnp.zeros(h.shape[2:], int)
+    coupled = _coupled(h)
+    for i in range(1, len(h)):
+        start = jnp.where(coupled[i - 1], start, i)
+        long = start < i - 1
+        first, last = jnp.where(long, start, first), jnp.where(long, i, last)
+    return first, last
 
 
-def _turn_rows(x: Complex, y: Complex, a: Complex, b: Complex, wanted: Array) -> tuple[Complex, ...]:
-    """The rotation ``c, s`` that eliminates ``b`` against ``a``, and the rotated rows ``x`` and ``y``; the identity
-    unless ``wanted``."""
-    norm = jnp.sqrt(a[0] ** 2 + a[1] ** 2 + b[0] ** 2 + b[1] ** 2)
-    turns = wanted & (norm > 0)
-    scale = jnp.where(turns, 1 / jnp.where(turns, norm, 1.0), 0.0)
-    c, s = (jnp.where(turns, a[0] * scale, 1.0), a[1] * scale), (b[0] * scale, b[1] * scale)
-    p, q, u, w = _conjugate_multiply(c, x), _conjugate_multiply(s, y), _multiply(c, y), _multiply(s, x)
-    return (p[0] + q[0], p[1] + q[1]), (u[0] - w[0], u[1] - w[1]), c, s
+def _shifts(h: Array, last: Array, count: Array) -> tuple[Array, Array]:
+    """Sum and product of both shifts: the eigenvalues of the last two rows; arbitrary ones in some sweeps break cycles."""
+    chosen = [last == i for i in range(len(h))]
+
+    def entry(row: int, column: int) -> Array:
+        return sum(jnp.where(chosen[i], h[i + row, i + column], 0.0) for i in range(2, len(h)))  # pyright: ignore[reportReturnType]
+
+    a, b, c, d = entry(-1, -1), entry(-1, 0), entry(0, -1), entry(0, 0)
+    size, odd = jnp.abs(c) + jnp.abs(entry(-1, -2)), count % 11 == 10
+    return jnp.where(odd, 1.5 * size, a + d), jnp.where(odd, size**2, a * d - b * c)
 
 
-def _turn_columns(x: Complex, y: Complex, c: Complex, s: Complex) -> tuple[Complex, Complex]:
-    """The columns ``x`` and ``y`` turned back."""
-    p, q, u, w = _multiply(x, c), _multiply(y, s), _conjugate_multiply(c, y), _conjugate_multiply(s, x)
-    return (p[0] + q[0], p[1] + q[1]), (u[0] - w[0], u[1] - w[1])
+def _start(k: int, h: Array, first: Array, last: Array, total: Array, product: Array) -> Array:
+    """What the reflection number ``k`` of a sweep turns, ``(r, ...)``: in the first row of the block the shifts."""
+    bulge = h[k : k + 3, k - 1] if k else jnp.zeros_like(h[:3, 0])
+    a, b, c = h[k, k], h[k + 1, k + 1], h[k + 1, k]
+    begins, goes = k == first, (k >= first) & (k < last)
+    below = h[k + 2, k + 1] if k + 2 < len(h) else jnp.zeros_like(a)
+    shifted = jnp.stack(
+        [(a * (a - total) + product) / jnp.where(begins & goes, c, 1.0) + h[k, k + 1], a + b - total, below]
+    )
+    x = jnp.where(begins, shifted[: len(bulge)], bulge)
+    inside = goes & (k + jnp.arange(len(bulge)).reshape(-1, *(1,) * goes.ndim) <= last)
+    return jnp.where(inside, x, 0.0)
 
 
-def _sweep(h: Complex, shift: Complex, size: Array) -> Complex:
-    """One QR step of the leading ``size`` rows: the rotations that make ``h - shift`` triangular, from both sides."""
-    n = h[0].shape[0]
-    active = jnp.arange(n) < size
-    h = _add_to_diagonal(h, (-shift[0], -shift[1]), active)
-    rows, rotations = [(h[0][i], h[1][i]) for i in range(n)], []
-    # Stored, because XLA would otherwise recompute and recompile each rotation for everything that depends on it.
-    for k in range(n - 1):
-        x, y = rows[k], rows[k + 1]
-        rows[k], rows[k + 1], *rotation = stored(_turn_rows)(x, y, *((r[0][k], r[1][k]) for r in (x, y)), active[k + 1])  # pyright: ignore[reportCallIssue]
-        rotations.append(rotation)
-    re, im = (jnp.stack([row[part] for row in rows]) for part in (0, 1))
-    columns: list[Complex] = [(re[:, j], im[:, j]) for j in range(n)]
-    for k, rotation in enumerate(rotations):
-        columns[k], columns[k + 1] = stored(_turn_columns)(columns[k], columns[k + 1], *rotation)
-    return _add_to_diagonal(tuple(jnp.stack([x[part] for x in columns], axis=1) for part in (0, 1)), shift, active)
+def _cleared(h: Array) -> Array:
+    """``h`` without its entries below the diagonal that are negligible or rounding of reflections."""
+    n, axes = len(h), (1,) * (h.ndim - 2)
+    kept = np.tri(n, k=-1).T + np.eye(n)
+    coupled = jnp.stack([*_coupled(h), jnp.zeros(h.shape[2:], bool)])
+    return jnp.where(
+        (kept > 0).reshape(n, n, *axes) | coupled & np.eye(n, k=-1, dtype=bool).reshape(n, n, *axes), h, 0.0
+    )
 
 
-def _size(a: Complex) -> Array:
-    return jnp.abs(a[0]) + jnp.abs(a[1])
+def _sweep(state: tuple) -> tuple:
+    """One double step of the QR iteration in every lane, in its own block of coupled rows."""
+    h, (first, last), count = state
+    h = stored(_cleared)(h)
+    total, product = stored(_shifts)(h, last, count)
+    for k in range(len(h) - 1):
+        h = _reflected(h, stored(partial(_start, k))(h, first, last, total, product), k)
+    return h, stored(_windows)(h), count + 1
 
 
 def eigenvalues(a: Array) -> tuple[Array, Array]:
@@ -226,38 +258,27 @@ def eigenvalues(a: Array) -> tuple[Array, Array]:
 
     Lanes that are not finite return NaN and do not delay the others.
     """
-    reduced = hessenberg(a)
-    h = (reduced, jnp.zeros_like(reduced))
-    n = a.shape[0]
-    if n > 2:
-        h = _deflated(h)
-    pairs = [_entry(h, i, i) for i in range(min(n, 2), n)]
-    pairs += _pair(*(_entry(h, i, j) for i in (0, 1) for j in (0, 1))) if n > 1 else [_entry(h, 0, 0)]
-    return jnp.stack([x for x, _ in pairs]), jnp.stack([y for _, y in pairs])
+    n, shape = len(a), a.shape[2:]
+    flat = a.reshape(n, n, -1)
+
+    def block(a: Array, lanes: int) -> tuple[Array, Array]:
+        h = hessenberg(jnp.where(jnp.isfinite(stored(largest)(a)), a, jnp.nan))
+        if n > 2:
+            state = h, stored(_windows)(h), jnp.int32(0)
+            h = jax.lax.while_loop(lambda s: any_lane(s[1][1] > 0) & (s[2] < _MAX_SWEEPS * n), _sweep, state)[0]
+        return stored(_of_blocks)(h)
+
+    real, imaginary = in_blocks(block, flat, flat.shape[-1], LANES, in_one_kernel)
+    return real.reshape(n, *shape), imaginary.reshape(n, *shape)
 
 
-def _deflated(h: Complex) -> Complex:
-    """``h`` after QR steps that decouple one row after the other from below, in every lane, until two rows are left.
-
-    One loop for all sizes, because compiling a loop takes seconds.
-    """
-
-    def step(state: tuple) -> tuple:
-        size, count, h = state
-        corner = tuple(jax.lax.dynamic_slice_in_dim(x, size - 2, 2, axis=0) for x in h)
-        corner = tuple(jax.lax.dynamic_slice_in_dim(x, size - 2, 2, axis=1) for x in corner)
-        above, last = _entry(corner, 0, 0), _entry(corner, 1, 1)
-        coupling = _size(_entry(corner, 1, 0))
-        loose = coupling > _EPS * (_size(last) + _size(above))
-        done = (count >= _MAX_SWEEPS) | ~jnp.any(loose)
-
-        def sweep() -> tuple:
-            shift = _pair(*(_entry(corner, i, j) for i in (0, 1) for j in (0, 1)))[1]
-            # An arbitrary shift in every tenth sweep breaks cycles.
-            kick = jnp.where(count % 10 == 9, 0.75, 0.0) * coupling
-            return size, count + 1, _sweep(h, (shift[0] + kick, shift[1] - kick / 2), size)
-
-        return jax.lax.cond(done, lambda: (size - 1, jnp.int32(0), h), sweep)
-
-    start = (jnp.int32(h[0].shape[0]), jnp.int32(0), h)
-    return jax.lax.while_loop(lambda state: state[0] > 2, step, start)[2]
+def _of_blocks(h: Array) -> tuple[Array, Array]:
+    """The eigenvalues of blocks of one and two rows."""
+    n, coupled = len(h), _coupled(h)
+    real, imaginary = [h[i, i] for i in range(n)], [jnp.zeros_like(h[0, 0])] * n
+    for i in range(n - 1):
+        pair = _pair(h[i, i], h[i, i + 1], h[i + 1, i], h[i + 1, i + 1])
+        for j in (0, 1):
+            real[i + j] = jnp.where(coupled[i], pair[j], real[i + j])
+            imaginary[i + j] = jnp.where(coupled[i], pair[2 + j], imaginary[i + j])
+    return jnp.stack(real), jnp.stack(imaginary)
