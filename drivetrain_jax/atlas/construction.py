@@ -1,12 +1,9 @@
 """Construction of an atlas, box by box, starting with the whole domain.
 
-- Where the function says how many polynomials a box needs (:attr:`Function.degrees`), and these are not too many, they are
-  computed at once; the truncation error is known beforehand.
-- Otherwise the nodes along each coordinate are doubled on the edges of the box until the coefficients have fallen. The
-  tensor of these degrees grows until its coefficients have fallen too. The truncation error is an estimate.
-
-Direct solves at held-out points test every panel. A box that needs too many nodes, or where solves fail, is halved. What
-remains unresolved is a :class:`~drivetrain_jax.atlas.Gap` with its reason.
+The nodes along each coordinate are doubled on the edges of the box until the coefficients have fallen. The tensor of these
+degrees grows until its coefficients have fallen too. Direct solves at held-out points test every panel. A box that needs
+too many nodes, or where solves fail, is halved. What remains unresolved is a :class:`~drivetrain_jax.atlas.Gap` with its
+reason.
 """
 
 from __future__ import annotations
@@ -30,27 +27,26 @@ from drivetrain_jax.atlas.panels import Atlas, Gap, Panel, position_between
 from drivetrain_jax.systems import Coordinate
 
 MAX_SOLVES = 400_000
-# Nodes along a coordinate: at first, and at most where they are found or known beforehand. Numbers at all nodes of a panel.
-_FIRST, _MOST, _MOST_GIVEN, _MAX_NUMBERS = 16, 128, 256, 30_000_000
+# Nodes along a coordinate: at first where they are solved and where they are given, and at most. Numbers at all nodes of a
+# panel.
+_FIRST, FIRST_GIVEN, _MOST, _MAX_NUMBERS = 16, 48, 128, 30_000_000
 # Nodes of a tensor beyond those that the edges need, and times that it may grow.
 _MARGIN, _GROWTHS = 2, 4
 # Splits of a box along a coordinate where solves fail and where too many nodes would be needed, and along all together.
 _FAILED, _UNRESOLVED, _MOST_SPLITS = 2, 6, 8
 HELD_OUT = 64
-# Ratio of a bound to the largest error at held-out points: where these show rounding alone, and where truncation as well.
-_SAFETY_KNOWN, _SAFETY = 4.0, 8.0
+# Ratio of a bound to the largest error at held-out points.
+_SAFETY = 8.0
 # Fraction of the tolerance that dropped coefficients may take, and that those on edges may have.
-_NEGLIGIBLE, _RESOLVED = 1e-3, 1 / 8
+_NEGLIGIBLE, _RESOLVED = 1e-3, 1 / 50
 # Coefficients that stop falling below this fraction of the largest one are noise of the solves.
 _NOISE = 1e-6
 # Relative width of a box in a coordinate that does not vary.
 _THINNEST = 1e-15
 
 Axes = Sequence[np.ndarray]
-# Starts to compute the values on a grid; returns a function that waits for them, ``(N, m)`` in C order.
-Start = Callable[[Axes], Callable[[], np.ndarray]]
-# Held-out points in coordinates and their values.
-Checks = tuple[np.ndarray, np.ndarray]
+# The values ``(N, m)`` on a grid in C order.
+Grid = Callable[[Axes], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -59,16 +55,12 @@ class Function:
 
     ``solve(x)``: values ``(N, m)`` at points ``(N, d)`` by direct solves, NaN where they fail, and bounds of the norms of
     their errors ``(N,)``. ``scale(values)`` ``(N,)``: the tolerance of an atlas limits the norm of the error over this.
-
-    ``start`` computes values on grids by other means than solves, NaN where they fail. ``degrees(lower, upper)``: numbers of
-    polynomials that a box needs along each coordinate, and the largest truncation error of their interpolant; infinite if
-    the numbers are only where a search for smaller ones begins.
+    ``grid`` computes values on grids by other means than solves, NaN where they fail.
     """
 
     solve: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
     scale: Callable[[np.ndarray], np.ndarray]
-    start: Start | None = None
-    degrees: Callable[[np.ndarray, np.ndarray], tuple[list[int], float]] | None = None
+    grid: Grid | None = None
 
 
 @dataclass(frozen=True)
@@ -79,17 +71,8 @@ class Box:
     upper: np.ndarray
     splits: tuple[int, ...]
 
-    def place(self, t: np.ndarray) -> np.ndarray:
-        """Coordinates of points ``t`` in [-1, 1]^d."""
-        return (self.lower * (1 - t) + self.upper * (1 + t)) / 2
-
-    def axes(self, counts: Sequence[int]) -> list[np.ndarray]:
-        """Coordinates of the nodes of a tensor, one array per coordinate."""
-        return [self.axis(k, count) for k, count in enumerate(counts)]
-
-    def axis(self, k: int, count: int) -> np.ndarray:
-        """The coordinate k of ``count`` nodes."""
-        t = nodes(count)
+    def place(self, t: np.ndarray, k: int | slice = slice(None)) -> np.ndarray:
+        """Coordinates of points ``t`` in [-1, 1]^d, or the coordinate ``k`` of positions in [-1, 1]."""
         return (self.lower[k] * (1 - t) + self.upper[k] * (1 + t)) / 2
 
     def halves(self, axis: int) -> tuple[Box, Box]:
@@ -129,9 +112,8 @@ class Domain:
     def _ends(self, k: int) -> list[float]:
         """Coordinates between which the domain lies; an even coordinate also includes that of 0."""
         even = self.coordinates[k].even and self.lower[k] < 0 < self.upper[k]
-        return [
-            float(self.coordinates[k].forward(p)) for p in (self.lower[k], self.upper[k], *((0.0,) if even else ()))
-        ]
+        values = self.lower[k], self.upper[k], *((0.0,) if even else ())
+        return [float(self.coordinates[k].forward(value)) for value in values]
 
 
 class _Unresolved(Exception):
@@ -167,17 +149,8 @@ def construct(domain: Domain, function: Function, tolerance: float, max_solves: 
                 boxes += box.halves(axis)
             else:
                 gaps.append(Gap(box.lower, box.upper, str(end)))
-    return Atlas(
-        domain.parameters,
-        domain.coordinates,
-        np.array(domain.lower, float),
-        np.array(domain.upper, float),
-        dict(domain.fixed),
-        tuple(panels),
-        tuple(gaps),
-        tolerance,
-        task.solves,
-    )
+    frame = domain.parameters, domain.coordinates, np.array(domain.lower, float), np.array(domain.upper, float)
+    return Atlas(*frame, dict(domain.fixed), tuple(panels), tuple(gaps), tolerance, task.solves)
 
 
 class _Construction:
@@ -190,23 +163,12 @@ class _Construction:
 
     def panel(self, box: Box) -> Panel:
         """The panel of a box; raises :class:`_Unresolved` if it has none."""
-        function, degrees, truncated = self._function, [_FIRST] * len(box.lower), np.inf
-        if function.degrees:
-            degrees, truncated = function.degrees(box.lower, box.upper)
-        if max(degrees) > _MOST_GIVEN:
-            degrees, truncated = [_FIRST] * len(degrees), np.inf
-        known = function.start is not None and np.isfinite(truncated)
-        waiting = function.start(box.axes(degrees)) if known else None  # pyright: ignore[reportOptionalCall]
-        # While the nodes are computed.
-        x = box.place(_held_out(len(degrees)))
         self._error = 0.0
+        x = box.place(_held_out(len(box.lower)))
         checks = x, self._solve(x)
-        panel = None
-        if waiting is not None:
-            panel = self._fit(box, degrees, waiting(), checks, truncated)[0]
-        elif function.start:
-            panel = self._adapted(box, degrees, checks, function.start)
-        return panel or self._adapted(box, [_FIRST] * len(degrees), checks, self._solved)  # pyright: ignore[reportReturnType]
+        # Values that are not what is solved are not used.
+        grid = self._function.grid
+        return (grid and self._fitted(box, checks, grid)) or self._fitted(box, checks, None)  # pyright: ignore[reportReturnType]
 
     def _solve(self, x: np.ndarray) -> np.ndarray:
         """Values at points ``(N, d)``; raises if solves fail or are too many."""
@@ -219,75 +181,58 @@ class _Construction:
         self._error = max(self._error, float(errors.max()))
         return values
 
-    def _solved(self, axes: Axes) -> Callable[[], np.ndarray]:
-        values = self._solve(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes)))
-        return lambda: values
+    def _solved(self, axes: Axes) -> np.ndarray:
+        return self._solve(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes)))
 
-    def _adapted(self, box: Box, counts: list[int], checks: Checks, start: Start) -> Panel | None:
-        """The panel whose degrees are found from ``counts`` on; None if ``start`` does not compute what is solved."""
-        limit = self._tolerance * float(self._function.scale(checks[1]).min())
-        counts = [self._needed(box, k, n, _RESOLVED * limit, start) + _MARGIN for k, n in enumerate(counts)]
+    def _fitted(self, box: Box, checks: tuple[np.ndarray, np.ndarray], grid: Grid | None) -> Panel | None:
+        """The panel from values of ``grid``, or of solves. None if ``grid`` does not compute what is solved.
+
+        ``checks`` are held-out points and their values.
+        """
+        (x, exact), compute = checks, grid or self._solved
+        scale, t = self._function.scale(exact), position_between(box.lower, box.upper, x)
+        limit = self._tolerance * float(scale.min())
+        counts = [self._needed(box, k, limit, compute) + _MARGIN for k in range(len(box.lower))]
         tails = np.zeros(len(counts))
         for _ in range(_GROWTHS):
-            if np.prod(counts, dtype=float) * checks[1].shape[1] > _MAX_NUMBERS:
+            if np.prod(counts, dtype=float) * exact.shape[1] > _MAX_NUMBERS:
                 raise _Unresolved("too many nodes would be needed", int(np.argmax(counts)), _UNRESOLVED)
-            values = start(box.axes(counts))()
-            panel, tails = self._fit(box, counts, values, checks, None, start == self._solved)
-            if panel or not np.isfinite(values).all():
-                return panel
+            values = compute([box.place(nodes(n), k) for k, n in enumerate(counts)])
+            if not np.isfinite(values).all():
+                return None
+            tensor = coefficients(values, counts)
+            tails = np.array([slabs(tensor, k)[-2:].sum() for k in range(len(counts))]) / (limit / 2)
+            # Coefficients far below the error of the values are their noise.
+            noise = np.linalg.norm(evaluate(tensor, t) - exact, axis=1).max() / np.prod(counts) ** 0.5
+            tensor = without_smallest(tensor, noise, _NEGLIGIBLE * limit)
+            errors = np.linalg.norm(evaluate(tensor, t) - exact, axis=1)
+            if (errors / scale).max() <= self._tolerance / 2 and tails.max() <= 1:
+                # Held-out solves do not show the error that all solved nodes have in common.
+                error = _SAFETY * errors.max() + _NEGLIGIBLE * limit + (0.0 if grid else self._error)
+                return Panel(box.lower, box.upper, tensor, float(error))
             grows = (tails > 1) | (tails.max() <= 1)
             counts = [n + max(2, n // 6) if more else n for n, more in zip(counts, grows, strict=True)]
-        if tails.max() <= 1 and start != self._solved:
+        if grid and tails.max() <= 1:
             return None
         raise _Unresolved("not resolved: not smooth", int(np.argmax(tails)) if tails.max() > 1 else None, _FAILED)
 
-    def _needed(self, box: Box, axis: int, count: int, limit: float, start: Start) -> int:
-        """Number of polynomials along a coordinate on all edges of the box, from ``count`` on."""
-        ends, count = [np.array(pair) for pair in zip(box.lower, box.upper, strict=True)], max(count, 4)
+    def _needed(self, box: Box, axis: int, limit: float, compute: Grid) -> int:
+        """Number of polynomials along a coordinate on all edges of the box."""
+        ends = [np.array(pair) for pair in zip(box.lower, box.upper, strict=True)]
+        count = _FIRST if compute == self._solved else FIRST_GIVEN
         while True:
-            axes = [box.axis(k, count) if k == axis else end for k, end in enumerate(ends)]
-            values = start(axes)().reshape(*map(len, axes), -1)
-            sizes = slabs(np.tensordot(analysis_matrix(count), values, axes=(1, axis)), 0)
-            tail = envelope(sizes)
+            axes = [box.place(nodes(count), k) if k == axis else end for k, end in enumerate(ends)]
+            values = compute(axes).reshape(*map(len, axes), -1)
+            tail = envelope(slabs(np.tensordot(analysis_matrix(count), values, axes=(1, axis)), 0))
             # Where values are missing, the tensor shows it.
-            if not tail[-3] > limit:
-                return int(np.count_nonzero(tail > limit))
+            if not tail[-3] > _RESOLVED * limit:
+                return int(np.count_nonzero(tail > _RESOLVED * limit))
             if count >= _MOST:
                 if tail[count // 2] < 4 * tail[-count // 8] and tail[count // 2] < _NOISE * tail[0]:
                     level = tail[count // 2] / tail[0]
                     raise _Unresolved(f"the values scatter by {level:.0e}, more than the tolerance allows", axis, 0)
                 raise _Unresolved("not resolved: too many nodes would be needed", axis, _UNRESOLVED)
             count = min(2 * count, _MOST)
-
-    def _fit(
-        self,
-        box: Box,
-        counts: list[int],
-        values: np.ndarray,
-        checks: Checks,
-        truncated: float | None,
-        solved: bool = False,
-    ) -> tuple[Panel | None, np.ndarray]:
-        """The panel from the values at its nodes, None if it is not accurate enough, and the tails relative to their limit.
-
-        ``truncated`` is the largest truncation error, None to estimate it from the last coefficients. Held-out solves do not
-        show the error that all ``solved`` nodes have in common.
-        """
-        (x, exact), scale = checks, self._function.scale(checks[1])
-        limit = self._tolerance * scale.min()
-        tensor = coefficients(values, counts)
-        last = [slabs(tensor, k)[-2:].sum() for k in range(len(counts))] if truncated is None else [truncated]
-        tails = np.array(last) / (limit / 2)
-        t = position_between(box.lower, box.upper, x)
-        # Coefficients far below the error of the values are their noise.
-        noise = np.linalg.norm(evaluate(tensor, t) - exact, axis=1).max() / np.prod(counts) ** 0.5
-        tensor = without_smallest(tensor, noise, _NEGLIGIBLE * limit)
-        errors = np.linalg.norm(evaluate(tensor, t) - exact, axis=1)
-        if not ((errors / scale).max() <= self._tolerance / 2 and tails.max() <= 1):
-            return None, tails
-        error = (_SAFETY if truncated is None else _SAFETY_KNOWN) * errors.max()
-        error += (truncated or 0.0) + _NEGLIGIBLE * limit + (self._error if solved else 0.0)
-        return Panel(box.lower, box.upper, tensor, float(error)), tails
 
 
 def _held_out(d: int) -> np.ndarray:

@@ -13,11 +13,12 @@ import jax
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._machine import compiling, threads, usable_cores
+from drivetrain_jax._machine import compiling, threads
 from drivetrain_jax.analysis.floquet.effort import stable_steps, steps_needed
 from drivetrain_jax.analysis.numerics.collocation import propagators_along
 from drivetrain_jax.analysis.numerics.kernels import Words, compiler_options, predicted, split
-from drivetrain_jax.atlas.construction import MAX_SOLVES, Axes, Domain, Function, construct
+from drivetrain_jax.atlas.charts import in_threads
+from drivetrain_jax.atlas.construction import FIRST_GIVEN, MAX_SOLVES, Axes, Domain, Function, construct
 from drivetrain_jax.atlas.panels import Atlas, Panel
 from drivetrain_jax.atlas.stability import StabilityAtlas
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, Series, Smoothness, System
@@ -141,82 +142,13 @@ def _function(
         # |dZ| <= 2 |Phi| |dPhi|.
         return np.linalg.norm(z, axis=(1, 2)) / (2 * np.linalg.norm(values, axis=1))
 
-    function = Function(solved, scale)
-    if (nodes := series_nodes(system, domain, tolerance)) is None:
-        return domain, function
+    nodes = series_nodes(system, domain, tolerance)
 
-    def start(axes: Axes) -> Callable[[], np.ndarray]:
-        waiting = nodes.start(axes)
+    def grid(axes: Axes) -> np.ndarray:
         at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
-        return lambda: balanced(domain.points(at), waiting())
+        return balanced(domain.points(at), nodes.grid(axes))  # pyright: ignore[reportOptionalMemberAccess]
 
-    return domain, Function(
-        solved, scale, start, partial(_degrees, system, domain, tolerance) if smoothness(system).balance else None
-    )
-
-
-# Numbers of polynomials from the growth in complex coordinates.
-
-
-# Truncation error relative to the tolerance, its least, and the most coordinates for which it is known beforehand: with
-# more, there are five times as many nodes as a search finds sufficient.
-_TRUNCATED, _ROUNDING, _FEW = 3e-4, 1e-15, 2
-_TOO_MANY = 10_000
-# Radii of the ellipses on which the growth is bounded, and arcs of half an ellipse.
-_RADII, _ARCS = np.geomspace(1.03, 200, 120), 48
-
-
-def _degrees(
-    system: type[System], domain: Domain, tolerance: float, lower: np.ndarray, upper: np.ndarray
-) -> tuple[list[int], float]:
-    """Numbers of polynomials on a box, and the largest truncation error; infinite with more than ``_FEW`` coordinates."""
-    corners = np.array(list(itertools.product(*zip(lower, upper, strict=True))))
-    columns = {**domain.fixed, **dict(zip(domain.parameters, domain.points(corners).T, strict=True))}
-    determinant = system.models["floquet"].build(columns).reduced.log_determinant
-    # The size of Phi falls with its determinant.
-    size = math.exp(float(np.min(determinant())) / 8) if determinant else 1.0
-    counts, error = polynomials_needed(system, domain, max(_TRUNCATED * tolerance * size, _ROUNDING), lower, upper)
-    return counts, error if len(lower) <= _FEW else math.inf
-
-
-def polynomials_needed(
-    system: type[System], domain: Domain, target: float, lower: np.ndarray, upper: np.ndarray
-) -> tuple[list[int], float]:
-    """Numbers of polynomials with which each coordinate leaves out at most ``target`` on a box, and a bound of the sum.
-
-    Interpolation at n Chebyshev nodes of a function bounded by M on the ellipse of radius r leaves out at most
-    4 M r^(1-n)/(r-1). With several coordinates these errors add up, each times the Lebesgue constants of earlier ones.
-    """
-    smooth, d = smoothness(system), len(lower)
-    corners = np.array(list(itertools.product(*zip(lower, upper, strict=True)))).T
-    fixed = {name: smooth.coordinate(name).forward(value) for name, value in domain.fixed.items()}
-    x = {**fixed, **dict(zip(domain.parameters, corners[..., None, None], strict=True))}
-    counts, error, lebesgue = [], 0.0, 1.0
-    for k, name in enumerate(domain.parameters):
-        around = (upper[k] + lower[k]) / 2 + (upper[k] - lower[k]) / 2 * _ARCS_AROUND
-        with np.errstate(all="ignore"):
-            growth = smooth.balance.growth({**x, name: around}, middle_of(domain))  # pyright: ignore[reportOptionalMemberAccess]
-        growth = np.broadcast_to(np.nan_to_num(growth, nan=np.inf), (2**d, *around.shape))
-        largest = growth.max(axis=(0, 2)) + np.log(4 / (_RADII - 1))
-        needed = 1 + (largest - math.log(target)) / np.log(_RADII)
-        best = int(np.argmin(needed))
-        if not needed[best] < _TOO_MANY:
-            return [_TOO_MANY] * d, math.inf
-        counts.append(max(math.ceil(needed[best]), 1))
-        error += lebesgue * math.exp(largest[best] - (counts[-1] - 1) * math.log(_RADII[best]))
-        lebesgue *= 1 + 2 / math.pi * math.log(counts[-1] + 1)
-    return counts, error
-
-
-def _ellipses() -> np.ndarray:
-    """Corners of boxes around the arcs of ellipses with the foci -1 and 1, ``(radii, 4 arcs)``: the growth rises to one."""
-    angles = np.linspace(0, math.pi, _ARCS + 1)
-    real, imaginary = (np.outer(_RADII + sign / _RADII, part(angles)) / 2 for sign, part in ((1, np.cos), (-1, np.sin)))
-    ends = slice(None, -1), slice(1, None)
-    return np.concatenate([real[:, i] + 1j * imaginary[:, j] for i in ends for j in ends], axis=1)
-
-
-_ARCS_AROUND = _ellipses()
+    return domain, Function(solved, scale, grid if nodes else None)
 
 
 # Nodes of an atlas from power series along one coordinate: a whole line costs as much as a few solves.
@@ -224,7 +156,7 @@ _ARCS_AROUND = _ellipses()
 
 # Lines computed together, and divisors of the number of positions along them, so that few kernels serve all panels: the
 # larger one for up to this number of lines, where more positions take less time than compiling another kernel.
-_LANES, _POSITIONS, _MORE, _FEW_LINES = 16, 24, 144, 256
+_LANES, _POSITIONS, _MORE, _FEW_LINES = 16, FIRST_GIVEN, 144, 256
 # Parts of the span per step of the explicit scheme at 1e-10, with a truncation error of 3e-14 of the propagator. Reduction
 # in parts per decade of looser tolerance (four at most). Parts per step of decay.
 _PARTS, _LEAST, _SPARED, _MOST_SPARED, _DECAY = 0.11, 3e-14, 0.0105, 4, 3.0
@@ -270,12 +202,11 @@ class SeriesNodes:
         names = tuple(name for name in domain.parameters if name != series.parameter)
         shapes = tuple((name, value.shape) for name, value in self._fixed.items())
         self._key = (system.models["floquet"].build, series, names, words, shapes)
+        # While held-out points are solved.
+        _kernel(self._key, FIRST_GIVEN)
 
-    def start(self, axes: Axes) -> Callable[[], np.ndarray]:
-        """Start computing the grid of ``axes``; returns a function that waits for the values ``(N, n n)`` in C order.
-
-        Values are NaN on lines along which the series does not converge.
-        """
+    def grid(self, axes: Axes) -> np.ndarray:
+        """Values ``(N, n n)`` on the grid of ``axes`` in C order, NaN on lines along which the series does not converge."""
         count, x = len(axes[self.axis]), axes[self.axis]
         lines = math.prod(len(axis) for axis in axes) // count
         x = np.pad(x, (0, -count % (_MORE if count > _POSITIONS and lines <= _FEW_LINES else _POSITIONS)), mode="edge")
@@ -285,25 +216,16 @@ class SeriesNodes:
         order = np.argsort(-parts, kind="stable")
         chunks = [order[i : i + _LANES] for i in range(0, len(order), _LANES)]
         # Requested before the threads start: each of them would compile it again.
-        kernel, pool = _kernel(self._key, len(x)), threads(usable_cores(), "tile")
-        pending = [
-            pool.submit(self._along, kernel, {n: c[chosen] for n, c in columns.items()}, end, parts[chosen[0]], x)  # pyright: ignore[reportArgumentType]
-            for chosen in chunks
-        ]
+        kernel = _kernel(self._key, len(x))
 
-        def values() -> np.ndarray:
-            try:
-                propagators = np.empty((len(parts), *pending[0].result().shape[1:]))
-                for chosen, future in zip(chunks, pending, strict=True):
-                    propagators[chosen] = future.result()[: len(chosen)]
-            finally:
-                for future in pending:
-                    future.cancel()
-            counts = [len(axis) for k, axis in enumerate(axes) if k != self.axis]
-            propagators = np.moveaxis(propagators[:, :count].reshape(*counts, count, -1), -2, self.axis)
-            return propagators.reshape(-1, propagators.shape[-1])
+        def along(chosen: np.ndarray) -> np.ndarray:
+            return self._along(kernel, {n: c[chosen] for n, c in columns.items()}, end, float(parts[chosen[0]]), x)
 
-        return values
+        computed = np.concatenate([values[: len(chosen)] for chosen, values in in_threads(chunks, along)])
+        propagators = np.empty((len(parts), count, computed.shape[-1]))
+        propagators[order] = computed[:, :count]
+        counts = [len(axis) for k, axis in enumerate(axes) if k != self.axis]
+        return np.moveaxis(propagators.reshape(*counts, count, -1), -2, self.axis).reshape(-1, computed.shape[-1])
 
     def _lines(self, axes: Sequence[np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """The parameters of all lines on a grid, except the one of the series, and the number of steps of each line."""

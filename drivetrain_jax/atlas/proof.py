@@ -12,13 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebvander
 
 from drivetrain_jax.atlas.charts import in_threads
-from drivetrain_jax.atlas.floquet import floquet_domain, middle_of, polynomials_needed, smoothness
+from drivetrain_jax.atlas.construction import Domain
+from drivetrain_jax.atlas.floquet import floquet_domain, middle_of, smoothness
 from drivetrain_jax.atlas.panels import Atlas, Panel
 from drivetrain_jax.systems import Enclosure, System
 from drivetrain_jax.systems._smoothness import UNIT, frobenius, rounding
@@ -122,6 +124,50 @@ def _bound(atlas: Atlas, panel: Panel, system: type[System]) -> float:
     if not np.isfinite(bound):
         raise _NoProof("rounding is too large for a proof")
     return bound
+
+
+# Radii of the ellipses on which the growth is bounded, arcs of half an ellipse, and too many polynomials.
+_RADII, _ARCS, _TOO_MANY = np.geomspace(1.03, 200, 120), 48, 10_000
+
+
+def polynomials_needed(
+    system: type[System], domain: Domain, target: float, lower: np.ndarray, upper: np.ndarray
+) -> tuple[list[int], float]:
+    """Numbers of polynomials with which each coordinate leaves out at most ``target`` on a box, and a bound of the sum.
+
+    Interpolation at n Chebyshev nodes of a function bounded by M on the ellipse of radius r leaves out at most
+    4 M r^(1-n)/(r-1). With several coordinates these errors add up, each times the Lebesgue constants of earlier ones.
+    """
+    smooth, d = smoothness(system), len(lower)
+    corners = np.array(list(product(*zip(lower, upper, strict=True)))).T
+    fixed = {name: smooth.coordinate(name).forward(value) for name, value in domain.fixed.items()}
+    x = {**fixed, **dict(zip(domain.parameters, corners[..., None, None], strict=True))}
+    counts, error, lebesgue = [], 0.0, 1.0
+    for k, name in enumerate(domain.parameters):
+        around = (upper[k] + lower[k]) / 2 + (upper[k] - lower[k]) / 2 * _ARCS_AROUND
+        with np.errstate(all="ignore"):
+            growth = smooth.enclosure.growth({**x, name: around}, middle_of(domain))  # pyright: ignore[reportOptionalMemberAccess]
+        growth = np.broadcast_to(np.nan_to_num(growth, nan=np.inf), (2**d, *around.shape))
+        largest = growth.max(axis=(0, 2)) + np.log(4 / (_RADII - 1))
+        needed = 1 + (largest - math.log(target)) / np.log(_RADII)
+        best = int(np.argmin(needed))
+        if not needed[best] < _TOO_MANY:
+            return [_TOO_MANY] * d, math.inf
+        counts.append(max(math.ceil(needed[best]), 1))
+        error += lebesgue * math.exp(largest[best] - (counts[-1] - 1) * math.log(_RADII[best]))
+        lebesgue *= 1 + 2 / math.pi * math.log(counts[-1] + 1)
+    return counts, error
+
+
+def _ellipses() -> np.ndarray:
+    """Corners of boxes around the arcs of ellipses with the foci -1 and 1, ``(radii, 4 arcs)``: the growth rises to one."""
+    angles = np.linspace(0, math.pi, _ARCS + 1)
+    real, imaginary = (np.outer(_RADII + sign / _RADII, part(angles)) / 2 for sign, part in ((1, np.cos), (-1, np.sin)))
+    ends = slice(None, -1), slice(1, None)
+    return np.concatenate([real[:, i] + 1j * imaginary[:, j] for i in ends for j in ends], axis=1)
+
+
+_ARCS_AROUND = _ellipses()
 
 
 def _log_determinant(enclosure: Enclosure, atlas: Atlas, points: np.ndarray) -> np.ndarray:

@@ -49,12 +49,10 @@ class Balance:
     """Interpolated is ``T Phi S`` with diagonal T and S that keep the multipliers: its entries are of one size, and bounded.
 
     ``scales(values, middle)`` are the diagonals of T and S, ``(n, ...)`` each, for columns of parameters; ``middle`` holds
-    one value of each parameter, for the whole domain. ``growth(x, middle)`` bounds ``ln |T Phi S|`` (Frobenius norm) for
-    columns ``x`` of the coordinates of all parameters, of which one may be complex.
+    one value of each parameter, for the whole domain.
     """
 
     scales: Callable[[Columns, Columns], tuple[np.ndarray, np.ndarray]]
-    growth: Callable[[Columns, Columns], np.ndarray]
 
 
 # Half a unit in the last place of a number between 1 and 2.
@@ -82,22 +80,23 @@ class Enclosure:
     ``(N, d)``, bounds of their errors, matrices ``(N, 4, 4)``, and bounds ``(N,)`` of the norms of their errors, infinite
     where there is none. ``coordinate(name, values)`` returns a coordinate and bounds of its errors.
     ``log_determinant(columns)`` is log det Z with a relative error of at most 24 units in the last place. It is 0 only
-    without damping, and in a box least at a corner.
+    without damping, and in a box least at a corner. ``growth(x, middle)`` bounds ``ln |T Phi S|`` (Frobenius norm) for
+    columns ``x`` of the coordinates of all parameters, of which one may be complex.
     """
 
     varying: tuple[str, ...]
     propagators: Callable[[Columns, Columns, Columns], tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]
     coordinate: Callable[[str, np.ndarray], tuple[np.ndarray, np.ndarray]]
     log_determinant: Callable[[Columns], np.ndarray]
+    growth: Callable[[Columns, Columns], np.ndarray]
 
 
 @dataclass(frozen=True)
 class Smoothness:
     """Coordinates by parameter in which the results of a model are smooth; a missing parameter is its own coordinate.
 
-    With ``series`` an atlas computes all its nodes along the parameter of the series together. With ``balance`` too, the
-    numbers of its polynomials and the error of leaving out all others are known beforehand; with ``enclosure`` as well, its
-    verdicts are proved.
+    With ``series`` an atlas computes all its nodes along the parameter of the series together. With ``balance`` its
+    polynomials are fewer; with ``enclosure`` its verdicts are proved.
     """
 
     coordinates: Mapping[str, Coordinate]

@@ -68,7 +68,7 @@ def _growth(x: Columns, middle: Columns) -> np.ndarray:
     return np.where(turn < 3.1, rotation + damped + coupled + np.log(end * start) / 2, np.inf)
 
 
-BALANCE = Balance(_scales, _growth)
+BALANCE = Balance(_scales)
 
 
 # Enclosures of propagators y' = s w B(eta) y with y = (q, p), eq. (10), over the clock u = tan(chi/2) from 0 to 1:
@@ -320,4 +320,4 @@ def _log_determinant_at(values: Columns) -> np.ndarray:
     return np.where(np.equal(values["zeta"], 0), 0.0, np.minimum(logarithm, -np.finfo(float).tiny))
 
 
-ENCLOSURE = Enclosure(("beta", "Omega"), _enclosed, _coordinate, _log_determinant_at)
+ENCLOSURE = Enclosure(("beta", "Omega"), _enclosed, _coordinate, _log_determinant_at, _growth)

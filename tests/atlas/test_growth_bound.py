@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 from drivetrain_jax.atlas import construction, floquet, interpolation
 from drivetrain_jax.atlas.floquet import floquet_domain, series_nodes
 from drivetrain_jax.atlas.panels import position
+from drivetrain_jax.atlas.proof import polynomials_needed
 from drivetrain_jax.systems import Coordinate, Series, Smoothness
 from drivetrain_jax.systems.cardan import SMOOTH
 from tests.oracles.atlas_direct import BASE, CARDAN, cardan_atlas, direct_radius, random_points, solves
@@ -60,7 +61,7 @@ def test_growth_bounds_propagators_of_complex_coordinates(seed):
         x[name] = random.uniform(-1, 2.5) + 1j * random.uniform(-3, 3)
     else:
         x[name] = x[name] * (random.uniform(-2, 2) + 1j * random.uniform(-2, 2))
-    assert balanced(x, middle) <= SMOOTH.balance.growth(x, middle)
+    assert balanced(x, middle) <= SMOOTH.enclosure.growth(x, middle)
 
 
 @pytest.mark.parametrize(
@@ -72,20 +73,16 @@ def test_truncation_errors_lie_within_their_bound(ranges, change):
     fixed = {name: value for name, value in ({**BASE, "beta": 0.9} | change).items() if name not in ranges}
     domain, function = floquet._function(CARDAN, ranges, fixed, 1e-9, lambda points: points)
     box = domain.box()
-    counts, bound = floquet._degrees(CARDAN, domain, 1e3, box.lower, box.upper)
+    counts, bound = polynomials_needed(CARDAN, domain, 0.3, box.lower, box.upper)
     t = np.random.default_rng(1).uniform(-1, 1, (500, len(counts)))
-    coarse, fine = (
-        interpolation.evaluate(interpolation.coefficients(function.start(box.axes(n))(), n), t)
-        for n in (counts, [n + 24 for n in counts])
-    )
+
+    def interpolated(counts):
+        axes = [box.place(interpolation.nodes(n), k) for k, n in enumerate(counts)]
+        return interpolation.evaluate(interpolation.coefficients(function.grid(axes), counts), t)
+
+    coarse, fine = interpolated(counts), interpolated([n + 24 for n in counts])
     error = np.linalg.norm(coarse - fine, axis=1).max()
     assert 1e-12 < error <= bound < 10
-
-
-def test_three_coordinates_are_searched():
-    domain = floquet_domain(CARDAN, RANGES | {"mu": (0.5, 2.0)}, BASE)
-    counts, error = floquet._degrees(CARDAN, domain, 1e-9, *(getattr(domain.box(), n) for n in ("lower", "upper")))
-    assert len(counts) == 3 and np.isinf(error)
 
 
 def test_held_out_points_lie_on_all_faces():
@@ -142,7 +139,7 @@ def test_grid_is_in_c_order_for_any_order_of_parameters():
     for order in (("beta", "Omega", "mu"), ("mu", "beta", "Omega"), ("Omega", "mu", "beta")):
         domain = domain_of({name: ranges[name] for name in order})
         coordinates = [c.forward(axes[name]) for c, name in zip(domain.coordinates, order, strict=True)]
-        values = series_nodes(CARDAN, domain, 1e-11).start(coordinates)().reshape(*map(len, coordinates), 16)
+        values = series_nodes(CARDAN, domain, 1e-11).grid(coordinates).reshape(*map(len, coordinates), 16)
         found[order] = np.transpose(values, (*(order.index(name) for name in axes), 3))
     first, *others = found.values()
     assert all(other == pytest.approx(first, abs=1e-12) for other in others)
@@ -151,13 +148,13 @@ def test_grid_is_in_c_order_for_any_order_of_parameters():
 def test_a_coordinate_may_be_negative(monkeypatch):
     """The coordinate -1/Omega gives the same lines from their other ends."""
     axes = [np.array([0.3, 1.2]), np.linspace(0.5, 5.0, 20)]
-    one = series_nodes(CARDAN, domain_of(RANGES), 1e-11).start(axes)()
+    one = series_nodes(CARDAN, domain_of(RANGES), 1e-11).grid(axes)
     forward, inverse = (lambda x: -1 / np.asarray(x),) * 2
     turned = Coordinate("-1/Omega", forward, inverse, lambda x: 1 / np.asarray(x) ** 2)
     model = CARDAN.models["atlas"]
     smooth = replace(model.smooth, coordinates={**model.smooth.coordinates, "Omega": turned})
     monkeypatch.setitem(CARDAN.models, "atlas", replace(model, smooth=smooth))
-    assert series_nodes(CARDAN, domain_of(RANGES), 1e-11).start([axes[0], -axes[1]])() == pytest.approx(one, abs=1e-12)
+    assert series_nodes(CARDAN, domain_of(RANGES), 1e-11).grid([axes[0], -axes[1]]) == pytest.approx(one, abs=1e-12)
 
 
 @pytest.mark.full
