@@ -84,7 +84,7 @@ def evaluated_tiles(
     kernel: Callable[[bool], Any],
     rtol: float,
 ) -> Iterator[tuple[Tile, Cells]]:
-    """Yield every tile with the results of its cells, ``(R, C)`` or ``(k, R, C)``, in order.
+    """Yield every tile with the results of its cells, ``(R, C)``, in order.
 
     ``axes`` are the axes of the grid in parameters; ``kernel(dense)`` returns the kernel of :func:`tile_kernel`.
     """
@@ -94,18 +94,12 @@ def evaluated_tiles(
     def work(tile: Tile) -> Cells:
         cells = tile.columns if tile.spread is None else tile.spread
         values = {name: axis[i] for name, axis, i in zip(names, axes, tile.index, strict=True)}
-        places, rows, columns = (1, *(len(i) for i in tile.index[-3:]))[-3:]
+        rows, columns = (len(i) for i in tile.index[-2:])
         values[names[-1]] = filled_up(values[names[-1]], cells.shape[1])
-        values[names[-2]] = filled_up(np.tile(filled_up(values[names[-2]], tile.rows), places), len(tile.first))
-        for name in names[-3:-2]:
-            values[name] = filled_up(np.repeat(values[name], tile.rows), len(tile.first))
+        values[names[-2]] = filled_up(values[names[-2]], len(tile.first))
         factors = (tile.first, tile.columns) if tile.spread is None else (tile.first, tile.columns, tile.spread)
         cells_of_tile = kernel(tile.spread is not None)(*factors, tile.panel.value_error, values, constants, rtol)
-        shape = (places, tile.rows, -1)[-min(len(names), 3) :]
-        return {
-            name: np.asarray(x)[: places * tile.rows].reshape(shape)[..., :rows, :columns]
-            for name, x in cells_of_tile.items()
-        }
+        return {name: np.asarray(x)[:rows, :columns] for name, x in cells_of_tile.items()}
 
     return in_threads(tiles, work)
 
@@ -136,17 +130,14 @@ def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
     ``kind``: ``dense`` or ``sparse`` like the tile, ``undamped`` for sparse tiles with cells that may be Hamiltonian.
     """
 
-    # Parameters that vary from row to row.
-    of_rows = names[-3:-1]
-
-    def bind(values: Mapping, fixed: Mapping, row: Mapping) -> FloquetModel:
-        leading = {name: values[name][0] for name in names[:-3]}
-        return build({**fixed, **leading, **row, names[-1]: values[names[-1]]})
+    def bind(values: Mapping, fixed: Mapping, row: Array) -> FloquetModel:
+        leading = {name: values[name][0] for name in names[:-2]}
+        return build({**fixed, **leading, names[-2]: row, names[-1]: values[names[-1]]})
 
     # Row by row, because the intermediate results of a row fit into the cache. The last product is inside the loop: a row
     # of a larger result would be copied at every use.
     def sparse(first, columns, error, values, fixed, rtol):
-        def row(inputs: tuple[Array, dict[str, Array]]) -> dict[str, Array]:
+        def row(inputs: tuple[Array, Array]) -> dict[str, Array]:
             weights, value = inputs
             model, phi = bind(values, fixed, value), weights @ columns
             log_d = jnp.broadcast_to(model.reduced.log_determinant(), phi.shape[1:])  # pyright: ignore[reportOptionalCall]
@@ -154,7 +145,7 @@ def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
             exact = exact_verdict(model, parts, error) if kind == "undamped" else None
             return results_of_coefficients(in_one_kernel(quartic.coefficients)(parts, log_d, error), rtol, exact)
 
-        return by_rows(row, (first, {name: values[name] for name in of_rows}))
+        return by_rows(row, (first, values[names[-2]]))
 
     def dense(first, columns, spread, error, values, fixed, rtol):
         parts = quartic.blocks(jnp.moveaxis(first @ columns, 1, 0))
@@ -162,13 +153,13 @@ def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
         # An error of Phi changes each cell as much as its own derivatives say, rounding of the nodes is spread.
         bounds = _largest(changes) + _SPREAD * jnp.max(rounding, axis=-1) + _left_out(at_nodes)
 
-        def row(inputs: tuple[Array, Array, dict[str, Array]]) -> dict[str, Array]:
+        def row(inputs: tuple[Array, Array, Array]) -> dict[str, Array]:
             e, bounds, value = inputs
             lanes = e @ spread
             log_d = jnp.broadcast_to(bind(values, fixed, value).reduced.log_determinant(), lanes.shape[1:])  # pyright: ignore[reportOptionalCall]
             return results_of_coefficients(quartic.with_determinant(lanes, bounds, log_d), rtol)
 
-        return by_rows(row, (at_nodes, bounds, {name: values[name] for name in of_rows}))
+        return by_rows(row, (at_nodes, bounds, values[names[-2]]))
 
     return jax.jit(dense if kind == "dense" else sparse, compiler_options=compiler_options())
 

@@ -19,14 +19,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import combinations
 from typing import Any
 
-import jax
 import numpy as np
+from jax import Array
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax.analysis.numerics.kernels import predicted
 from drivetrain_jax.atlas import interpolation
 from drivetrain_jax.atlas.panels import Atlas, Panel, derivative, position
 from drivetrain_jax.systems import System
@@ -35,8 +35,6 @@ PLUS, MINUS, PAIR = "+1", "-1", "pair"
 # A zero bounds the stable region only if no multiplier grows. A growth rate above this value counts as real.
 LIMITING = 1e-6
 _STATES = 4
-# Points per call of the determinant: few sizes, so few compilations.
-_BLOCKS = (64, 512, 4096)
 
 
 def has_boundaries(atlas: Atlas, system: type[System]) -> bool:
@@ -94,15 +92,10 @@ class Criteria:
 
     def log_determinant(self, x: np.ndarray) -> np.ndarray:
         """log det Z, ``(N, d) -> (N,)``, exact if the system gives it."""
-        values = self._values(x)
-        size = next((n for n in _BLOCKS if n >= len(x)), _BLOCKS[-1])
-        parts = []
-        for start in range(0, len(x), size):
-            block = {name: column[start : start + size] for name, column in values.items()}
-            count = len(x[start : start + size])
-            padded = {name: np.pad(column, (0, size - count), mode="edge") for name, column in block.items()}
-            parts.append(np.asarray(_determinant(self.system.models["floquet"].build)(padded))[:count])
-        return np.concatenate(parts) if parts else np.empty(0)
+        if not len(x):
+            return np.empty(0)
+        columns = dict(zip(self.atlas.parameters, parameters_at(self.atlas, x).T, strict=True))
+        return predicted(_log_determinant, (self.system.models["floquet"].build,), {**self.atlas.fixed, **columns})
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """The functions at points, ``(N, d) -> (k, N)``."""
@@ -179,12 +172,6 @@ class Criteria:
         trace, second, _ = invariants(monodromy(phi))
         return (a * d > 0) & (b * c > 0) & (trace**2 / 4 - second + 2 > 0) & (np.abs(trace) < 4)
 
-    def _values(self, x: np.ndarray) -> dict[str, np.ndarray]:
-        columns = dict(zip(self.atlas.parameters, parameters_at(self.atlas, x).T, strict=True))
-        names = self.system.models["floquet"].parameters
-        parameters = {name: columns.get(name, self.atlas.fixed.get(name)) for name in names}
-        return {name: np.broadcast_to(np.asarray(v, float), len(x)) for name, v in parameters.items() if v is not None}
-
 
 def parameters_at(atlas: Atlas, x: np.ndarray) -> np.ndarray:
     """Parameters of points in coordinates, ``(..., d)``, clipped to the domain against rounding; NaN stays NaN."""
@@ -227,14 +214,8 @@ def _block_determinants(phi: np.ndarray) -> list[np.ndarray]:
     return [phi[i, j] * phi[i + 1, j + 1] - phi[i, j + 1] * phi[i + 1, j] for i, j in corners]
 
 
-@lru_cache
-def _determinant(build: Callable) -> Callable:
-    """Compiled log det Z of a model, cached for all its atlases."""
-
-    def exact(values: Mapping[str, jax.Array]) -> jax.Array:
-        return build(values).reduced.log_determinant()
-
-    return jax.jit(exact)
+def _log_determinant(build: Callable, values: Mapping[str, Any]) -> Array:
+    return build(values).reduced.log_determinant()
 
 
 # Growth rate ln|sigma| of one Floquet multiplier with its derivatives, from left and right eigenvectors.

@@ -19,7 +19,6 @@ import numpy as np
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.panels import Atlas
-from drivetrain_jax.atlas.patches import Patches, patches_of, ridge_roots
 from drivetrain_jax.atlas.windows import (
     Crossing,
     Interval,
@@ -42,6 +41,8 @@ Direct = Callable[[Mapping[str, np.ndarray]], np.ndarray]
 _BOUNDS, _PART, _LEAST = 10.0, 1e-6, 1e-9
 # Points of a range at which a check solves, and points at which it searches the maximum on the surrogate.
 _SAMPLES, DENSE = 101, 801
+# Distances of points from a crossing, relative to the range.
+_AROUND = np.concatenate([[0.0], *(sign * np.geomspace(1e-11, 1, 400) for sign in (-1, 1))])
 # Largest distance of direct solves from the unit circle that counts as on it.
 ON_THE_CIRCLE = 1e-6
 
@@ -89,22 +90,20 @@ class End:
 def check_ends(ends: list[End], line: Line, criteria: Criteria, direct: Direct) -> Check | None:
     """Check all ``ends`` of stable intervals of ``line`` by direct solves just inside and just beyond; None without ends.
 
-    Inside, the solves cover the whole range of the other coordinate. Beyond, they lie on the ridge of the tongue at the
-    crossing, or at the crossing itself without a ridge. On both sides one solve is at the maximum of the surrogate.
+    Inside, the solves cover the whole range of the other coordinate. On both sides, two lie at the maximum of the surrogate
+    over the whole range, and about the crossing.
     """
     part = criteria.atlas
     k = part.parameters.index(line.parameter)
     other, span = part.parameters[1 - k], float(part.upper[k] - part.lower[k])
     within = np.linspace(part.lower[1 - k], part.upper[1 - k], _SAMPLES)
-    patches = patches_of(criteria) if any(end.crossing for end in ends) else ()
     points, outer = [], []
     for end in ends:
         step = end.step(span)
         inner, value = end.value + end.inward * min(step, end.length / 2), end.value - end.inward * step
-        near, far = (_along_ridge(criteria, patches, k, end.crossing, x, other) for x in (inner, value))
-        points += [(x, inner) for x in (*within, *near, _worst(criteria, k, inner))]
+        points += [(x, inner) for x in (*within, *_worst(criteria, k, inner, end.crossing))]
         if end.crossing and _unstable(line, value):
-            outer += [(x, value) for x in (*far, _worst(criteria, k, value))]
+            outer += [(x, value) for x in _worst(criteria, k, value, end.crossing)]
     if not points:
         return None
     columns = np.array(points + outer).T
@@ -113,36 +112,16 @@ def check_ends(ends: list[End], line: Line, criteria: Criteria, direct: Direct) 
     return _check(inside, beyond.reshape(-1, 2).max(axis=1), criteria, len(rho))
 
 
-def _along_ridge(
-    criteria: Criteria, patches: tuple[Patches, ...], k: int, crossing: Crossing | None, value: float, other: str
-) -> tuple[float, ...]:
-    """Positions over ``other`` at which the tongue of ``crossing`` is expected, at a ``value`` of the coordinate ``k``.
-
-    A slanted ridge leaves the narrow tongue sideways, so the position of the tip does not apply. None without a crossing.
-    """
-    if crossing is None:
-        return ()
-    part, place = criteria.atlas, crossing.point[other]
-    low, high = part.lower[1 - k], part.upper[1 - k]
-    # At the ends of the range a tongue enters from outside; without damping the functions have no ridges.
-    if not low < place < high or criteria.conservative:
-        return (place,)
-    tip, beside = (np.insert([place], k, v)[None] for v in (crossing.value, value))
-    function = patches[criteria.multipliers.index(crossing.multiplier)]
-    bottom = part.to_coordinates(beside)[0, k]
-    foot = ridge_roots(function, part.to_coordinates(tip), 1 - k, bottom)[0]
-    if not np.isfinite(foot):
-        return (place,)
-    position = part.to_parameters(np.insert([foot], k, bottom)[None])[0, 1 - k]
-    return (float(np.clip(position, low, high)),)
-
-
-def _worst(criteria: Criteria, k: int, value: float) -> float:
-    """Position of the surrogate's largest spectral radius over the coordinate other than ``k``, which has ``value``."""
-    part = criteria.atlas
-    others = np.linspace(part.lower[1 - k], part.upper[1 - k], DENSE)
-    rho = criteria.spectral_radius(part.to_coordinates(np.insert(others[:, None], k, value, axis=1)))
-    return float(others[np.argmax(np.nan_to_num(rho))])
+def _worst(criteria: Criteria, k: int, value: float, crossing: Crossing | None) -> list[float]:
+    """Positions over the other coordinate than ``k``, which has ``value``, of the surrogate's largest spectral radius: over
+    the whole range, and over points ever closer to the ``crossing``, whose tongue may be narrow and slanted."""
+    part, lower, upper = criteria.atlas, *(float(end[1 - k]) for end in (criteria.atlas.lower, criteria.atlas.upper))
+    ranges = [np.linspace(lower, upper, DENSE)]
+    if crossing:
+        place = crossing.point[part.parameters[1 - k]]
+        ranges.append(np.clip(place + (upper - lower) * _AROUND, lower, upper))
+    rho = [criteria.spectral_radius(part.to_coordinates(np.insert(x[:, None], k, value, axis=1))) for x in ranges]
+    return [float(x[np.argmax(np.nan_to_num(r))]) for x, r in zip(ranges, rho, strict=True)]
 
 
 def check_window(safe: Range, interval: Interval, line: Line, criteria: Criteria, direct: Direct) -> Check:

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
-from itertools import groupby, islice
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +25,6 @@ NODES = 24
 _SPAN = 11.0
 # Fraction of the width of a tile above which nodes are used: other tiles cost half as much again, but are always full.
 _DENSE = 2 / 3
-# Cells of a tile of several rectangles: small tiles cost as much time in Python as in their kernel.
-_CELLS = 1 << 16
 # Widths are multiples of a step. Cost of a cell with and without nodes, and of a row of a tile, in cells. A width is chosen
 # over the one that divides the cells evenly below this ratio of costs, so that most charts of a size share one kernel.
 _STEP, _COSTS, _ROW, _WORTH = 16, {True: 1.0, False: 1.6}, 100, 0.95
@@ -36,18 +32,16 @@ _STEP, _COSTS, _ROW, _WORTH = 16, {True: 1.0, False: 1.6}, 100, 0.95
 
 @dataclass(frozen=True)
 class Tile:
-    """A rectangle of a grid within one panel, or several at neighbouring places along the axis before the last two.
+    """A rectangle of a grid within one panel.
 
-    ``index`` holds the positions along each axis of the grid: one position along each leading axis, except that several
-    rectangles have several along the last leading axis. ``first`` ``(R, m, n)`` is the contracted tensor of the panel in
-    each row; each rectangle has ``rows`` rows. ``columns`` ``(n, C)`` are T_j at the cells. In a dense tile ``columns``
+    ``index`` holds the positions along each axis of the grid, one along each leading axis. ``first`` ``(R, m, n)`` is the
+    contracted tensor of the panel in each row. ``columns`` ``(n, C)`` are T_j at the cells. In a dense tile ``columns``
     ``(n, NODES)`` are T_j at the nodes, and ``spread`` ``(NODES, C)`` interpolates from the nodes to the cells.
     """
 
     panel: Panel
     index: tuple[np.ndarray, ...]
     first: Array
-    rows: int
     columns: np.ndarray
     spread: np.ndarray | None
 
@@ -66,28 +60,25 @@ def tiles(
 ) -> Iterator[Tile]:
     """Yield tiles that cover the panels' part of the grid of ``axes``, two or more rising arrays in coordinates.
 
-    A tile has at most ``most`` rows and columns. Where rectangles are small, a tile has several of them and more rows. Tiles
-    overlap on faces that panels share: the last tile belongs to the panel of :meth:`Atlas.find`. Without ``dense`` no tile
-    has nodes. A part of a chart of ``rows`` rows has tiles of the same shape as all other parts.
+    A tile has at most ``most`` rows and columns. Tiles overlap on faces that panels share: the last tile belongs to the
+    panel of :meth:`Atlas.find`. Without ``dense`` no tile has nodes. A part of a chart of ``rows`` rows has tiles of the
+    same shape as all other parts.
     """
     if not atlas.panels:
         return
     degrees = np.max([panel.degrees for panel in atlas.panels], axis=0)[-2:]
     # An even number of rows of tiles, so two cores finish at the same time.
     shape = _shared(rows or len(axes[-2]), most[0], 8, 2), _width(atlas, axes[-1], most[1], dense)
-    assigned = list(_assigned(atlas, axes))
-    largest = max((len(groups[-2]) for _, groups in assigned), default=0)
-    for panel, groups in assigned:
+    for panel, groups in _assigned(atlas, axes):
         bands = _kinds_first(list(_bands(panel, axes[-1], groups[-1], degrees[1], shape[1], dense)))
-        rows, places, total = _stacked(axes, len(groups[-2]), largest, shape)
-        for fixed, reduced in _runs(_reductions(panel, axes, groups[:-2]), places):
-            tensors = filled_up(np.stack([_padded(panel_of_place, degrees) for panel_of_place in reduced]), places)
-            for start in range(0, len(groups[-2]), rows):
-                chosen = groups[-2][start : start + rows]
-                weights = filled_up(chebyshev(_positions(panel, -2, axes[-2][chosen]), degrees[0]), rows)
-                first = _first_product(weights, tensors, total)
+        for fixed, reduced in _reductions(panel, axes, groups[:-2]):
+            tensor = _padded(reduced, degrees)
+            for start in range(0, len(groups[-2]), shape[0]):
+                chosen = groups[-2][start : start + shape[0]]
+                weights = filled_up(chebyshev(_positions(panel, -2, axes[-2][chosen]), degrees[0]), shape[0])
+                first = _first_product(weights, tensor)
                 for band in bands:
-                    yield Tile(panel, (*fixed, chosen, band.chosen), first, rows, band.columns, band.spread)
+                    yield Tile(panel, (*fixed, chosen, band.chosen), first, band.columns, band.spread)
 
 
 def _padded(panel: Panel, degrees: Sequence[int]) -> np.ndarray:
@@ -96,54 +87,29 @@ def _padded(panel: Panel, degrees: Sequence[int]) -> np.ndarray:
     return np.ascontiguousarray(np.moveaxis(np.pad(panel.coefficients, [*fill, (0, 0)]), -1, 1))
 
 
-def _stacked(axes: Sequence[np.ndarray], count: int, largest: int, shape: tuple[int, int]) -> tuple[int, int, int]:
-    """Rows of a rectangle, number of rectangles of a tile, and rows of a tile, for a panel of ``count`` rows.
-
-    ``largest`` is the number of rows of the largest panel.
-    """
-    rows, most = (-(-n // 8) * 8 for n in (count, largest))
-    places = min(_CELLS // (most * shape[1]), len(axes[-3]) if len(axes) > 2 else 1)
-    if places < 2:
-        return shape[0], 1, shape[0]
-    return rows, places * most // rows, places * most
-
-
-def _runs(
-    reductions: Iterator[tuple[tuple[int, ...], Panel]], most: int
-) -> Iterator[tuple[tuple[np.ndarray, ...], list[Panel]]]:
-    """Yield positions along the leading axes, and up to ``most`` panels there that differ along the last of these axes."""
-    for _, line in groupby(reductions, key=lambda reduction: reduction[0][:-1]):
-        while run := list(islice(line, most)):
-            places, panels = zip(*run, strict=True)
-            yield tuple(np.unique(positions) for positions in zip(*places, strict=True)), list(panels)
-
-
-@partial(jax.jit, static_argnames="total")
-def _first_product(weights: Array, tensors: Array, total: int) -> Array:
-    """``(R, n_1)`` times each of ``(k, n_1, m, n)``, filled up to ``(total, m, n)``.
-
-    The BLAS threads of NumPy would compete with the worker threads.
-    """
-    k, n, *rest = tensors.shape
-    product = jnp.einsum("rn,knx->krx", weights, tensors.reshape(k, n, -1)).reshape(-1, *rest)
-    return jnp.pad(product, ((0, total - len(product)), (0, 0), (0, 0)))
+@jax.jit
+def _first_product(weights: Array, tensor: Array) -> Array:
+    """``(R, n_1)`` times ``(n_1, m, n)``. The BLAS threads of NumPy would compete with the worker threads."""
+    return jnp.einsum("rn,nx->rx", weights, tensor.reshape(len(tensor), -1)).reshape(-1, *tensor.shape[1:])
 
 
 def _reductions(
     panel: Panel, axes: Sequence[np.ndarray], groups: Sequence[np.ndarray]
-) -> Iterator[tuple[tuple[int, ...], Panel]]:
+) -> Iterator[tuple[tuple[np.ndarray, ...], Panel]]:
     """Yield the position of each cell of the leading axes, and the panel of the last two coordinates there.
 
     Cells that share their first coordinates share the products with the whole tensor, which cost most.
     """
 
-    def reduced(coefficients: np.ndarray, fixed: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], Panel]]:
+    def reduced(
+        coefficients: np.ndarray, fixed: tuple[np.ndarray, ...]
+    ) -> Iterator[tuple[tuple[np.ndarray, ...], Panel]]:
         k = len(fixed)
         if k == len(groups):
             yield fixed, Panel(panel.lower[-2:], panel.upper[-2:], coefficients, 0.0)
             return
-        for i in groups[k]:
-            weights = chebyshev(_positions(panel, k, axes[k][i : i + 1]), panel.degrees[k])[0]
+        for i in np.split(groups[k], len(groups[k])):
+            weights = chebyshev(_positions(panel, k, axes[k][i]), panel.degrees[k])[0]
             yield from reduced(np.tensordot(weights, coefficients, axes=(0, 0)), (*fixed, i))
 
     return reduced(panel.coefficients, ())

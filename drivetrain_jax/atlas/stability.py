@@ -228,11 +228,9 @@ def _store(results: Mapping[str, np.ndarray], tile: Tile, cells: charts.Cells) -
     for name, values in results.items():
         part = values[place]
         part[...] = cells[name].reshape(part.shape)
-    dims = cells["unsure"].ndim
-    unsure = np.argwhere(cells["unsure"]) if cells["unsure"].any() else np.empty((0, dims), int)
-    first = [i[0] for i in tile.index]
-    leading = np.broadcast_to(np.array(first[:-dims], int), (len(unsure), len(first) - dims))
-    return np.concatenate([leading, unsure + first[-dims:]], axis=1)
+    if not cells["unsure"].any():
+        return np.empty((0, len(place)), int)
+    return np.argwhere(cells["unsure"].reshape([len(i) for i in tile.index])) + [i[0] for i in tile.index]
 
 
 @lru_cache(maxsize=16)
