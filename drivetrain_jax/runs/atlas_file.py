@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -20,6 +21,7 @@ from drivetrain_jax.analysis import OUTCOME, Request, get_analysis
 from drivetrain_jax.analysis._base import make_request
 from drivetrain_jax.analysis.atlas import ANALYSIS
 from drivetrain_jax.atlas import StabilityAtlas, from_arrays, proof, stability_atlas, to_arrays
+from drivetrain_jax.atlas.balls import contradictions
 from drivetrain_jax.atlas.floquet import floquet_domain, smoothness
 from drivetrain_jax.runs.assemble import ResultBuffer, labelled, result_attrs, to_dataset
 from drivetrain_jax.runs.axes import Axis, in_unit
@@ -84,6 +86,8 @@ def broadcast(values: Mapping[str, Any]) -> tuple[xr.DataArray, ...]:
 _CELLS = 256
 # Most cells of a chart whose proofs are counted: a cell takes two microseconds.
 _TESTED = 1 << 16
+# Random points compared with ball arithmetic.
+_BALLS = 100
 # Relative error of forced amplitudes, which are compared with a limit.
 _AMPLITUDE = 1e-6
 # Variables of the file: name, dimensions, meaning. Boxes are in the coordinates named by the attribute.
@@ -523,6 +527,14 @@ def verify_proof(path: Path) -> tuple[str, str]:
     line = f"{lines}; {agree} of {codes.size} verdicts of a chart proved"
     other = int(both.sum()) - agree
     problem = wrong if computed > claimed else f"{other} verdicts contradict the proof; expected none" if other else ""
+    if find_spec("flint"):
+        low, high = np.array(list(stored.ranges.values())).T
+        points = low + (high - low) * np.random.default_rng().random((_BALLS, len(low)))
+        other = contradictions(
+            replace(atlas, panels=tuple(proved)), system, points, stored.stability.at(points)["verdict"]
+        )
+        line += f"; {_BALLS - other} of {_BALLS} random points agree with ball arithmetic"
+        problem = problem or (f"{other} points contradict ball arithmetic; expected none" if other else "")
     return line, problem
 
 

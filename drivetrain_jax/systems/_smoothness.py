@@ -81,7 +81,8 @@ class Enclosure:
     where there is none. ``coordinate(name, values)`` returns a coordinate and bounds of its errors.
     ``log_determinant(columns)`` is log det Z with a relative error of at most 24 units in the last place. It is 0 only
     without damping, and in a box least at a corner. ``growth(x, middle)`` bounds ``ln |T Phi S|`` (Frobenius norm) for
-    columns ``x`` of the coordinates of all parameters, of which one may be complex.
+    columns ``x`` of the coordinates of all parameters, of which one may be complex. ``balls(values, middle)`` contains
+    ``T Phi S`` at one point, an ``arb_mat`` of python-flint, by other code.
     """
 
     varying: tuple[str, ...]
@@ -89,6 +90,7 @@ class Enclosure:
     coordinate: Callable[[str, np.ndarray], tuple[np.ndarray, np.ndarray]]
     log_determinant: Callable[[Columns], np.ndarray]
     growth: Callable[[Columns, Columns], np.ndarray]
+    balls: Callable[[Columns, Columns], Any] | None = None
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from drivetrain_jax.systems._smoothness import UNIT, Balance, Columns, Enclosure, frobenius, rounding
+from drivetrain_jax.systems.cardan_balls import propagator
 
 # Growth and scales of T Phi S, eqs (15)-(16).
 
@@ -320,4 +321,4 @@ def _log_determinant_at(values: Columns) -> np.ndarray:
     return np.where(np.equal(values["zeta"], 0), 0.0, np.minimum(logarithm, -np.finfo(float).tiny))
 
 
-ENCLOSURE = Enclosure(("beta", "Omega"), _enclosed, _coordinate, _log_determinant_at, _growth)
+ENCLOSURE = Enclosure(("beta", "Omega"), _enclosed, _coordinate, _log_determinant_at, _growth, propagator)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivetrain_jax.atlas import proof
+from drivetrain_jax.atlas import balls, proof
 from drivetrain_jax.atlas.floquet import middle_of
 from drivetrain_jax.systems import cardan_bounds, get_system
 from tests.oracles.atlas_direct import BASE, CARDAN, cardan_atlas, direct_radius, propagators, random_points
@@ -45,6 +45,16 @@ def faces(atlas, count, seed=0):
     for i, (k, end) in enumerate(itertools.product(range(points.shape[1]), (0, 1))):
         points[i::8, k] = ends[end, k]
     return np.concatenate([points, np.array(list(itertools.product(*ends.T)))])
+
+
+def test_ball_arithmetic_confirms_panels_and_refutes_wrong_ones(chart):
+    pytest.importorskip("flint")
+    points = random_points(chart, 3, seed=11)
+    stated = chart.at(points)["verdict"]
+    sharper = replace(chart.atlas, panels=tuple(replace(p, proved_error=1e-16) for p in chart.atlas.panels))
+    assert balls.contradictions(chart.atlas, CARDAN, points, stated) == 0
+    assert balls.contradictions(chart.atlas, CARDAN, points, 1 - stated) == 3
+    assert balls.contradictions(sharper, CARDAN, points, stated) == 3
 
 
 def test_nodes_integrate_polynomials():

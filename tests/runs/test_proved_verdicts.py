@@ -34,6 +34,7 @@ def path(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def few_cells(monkeypatch):
     monkeypatch.setattr(atlas_file, "_CELLS", 40)
+    monkeypatch.setattr(atlas_file, "_BALLS", 2)
 
 
 def printed(capsys, *arguments):
