@@ -1,7 +1,7 @@
 """Forced response: periodic solution of the linearised system, and the nonlinear periodic orbit with its multipliers.
 
 Linear: the variational equations over one period T from rest give ``y(T; y0) = r + Z y0``, hence ``y0 = (I - Z)^-1 r``.
-Nonlinear: Newton shooting along growing forcing (:func:`~drivetrain_jax.analysis.forced.orbit.shoot`), and along the speed
+Nonlinear: continuation along growing forcing (:func:`~drivetrain_jax.analysis.forced.orbit.shoot`), and along the speed
 of the system, if it has one, from below and from above (:mod:`~drivetrain_jax.analysis.forced.orbit`), unless the
 first orbit is nearly the linear response. Of several orbits the result is the stable one of the smallest amplitude, or the
 smallest one if none is stable; ``orbit_count`` is their number. Orbits on branches that these paths do not meet are not
@@ -169,7 +169,7 @@ def _peaks_on_step(
 
     (slope0, curve0), (slope1, curve1) = derivatives(t0, y0), derivatives(t1, y1)
 
-    def of(i: Array) -> _Found:
+    def peak_of(i: Array) -> _Found:
         x, inside = _cubic_root(slope0[i], slope1[i], h * curve0[i], h * curve1[i])
         y = evaluate(t0 + x * h)
         slope, curve = (d[i] for d in derivatives(t0 + x * h, y))
@@ -178,7 +178,7 @@ def _peaks_on_step(
         between = jnp.where(inside, jnp.abs(value), 0.0), jnp.clip(x + shift / h, 0.0, 1.0)
         return _Found(jnp.abs(y1[i]), jnp.abs(near_end), late, *between)
 
-    return jax.vmap(of)(jnp.array(indices))
+    return jax.vmap(peak_of)(jnp.array(indices))
 
 
 def _vertex(y: Array, slope: Array, curve: Array) -> tuple[Array, Array]:
@@ -341,7 +341,7 @@ def nonlinear_orbit(model: ForcedModel, response: Response, rtol: float, search:
     start = jnp.where(usable, response.state, 0.0)
     # Nonlinearity matters for states of order one; a smaller response is measured in units of its own size.
     unit, sharp = jnp.minimum(size_of(start), 1.0), _sharpness(rtol, TRANSITION_SHARPNESS)
-    first = shoot(in_units_of(unit, model.field), start / unit, model.period, sharp)
+    first = shoot(in_units_of(unit, model.field), model.period, start.size, sharp)
     first = first._replace(
         state=unit * first.state, error=unit * first.error, outcome=jnp.where(usable, first.outcome, response.outcome)
     )

@@ -1,4 +1,4 @@
-"""Periodic orbits of forced systems: transition over a period and Newton shooting with continuation.
+"""Periodic orbits of forced systems: transition over a period, Newton's method, and continuation.
 
 All functions work on one point. Derivatives come from the variational equations, never from differentiating a solver.
 
@@ -34,20 +34,6 @@ ATOL_RATIO = 1e-6
 # Shortest step over period: a field that is not finite then fails at once instead of after MAX_STEPS rejections.
 STEP_RATIO = 1e-10
 
-MAX_CORRECTIONS = 300
-# Steps of all corrections after which the search ends; without this limit an extreme search takes up to 2e7. A usual
-# correction takes 50 to 1000 steps, a usual search up to a hundred corrections.
-MAX_SEARCH = 400_000
-SHORTEST_STRIDE = 1e-5
-# Value of lambda at which the search ends: with the forcing reversed, the path is not expected to return.
-TURNED_AWAY = -1.0
-# A stride is kept if its first correction is below this fraction of the stride, and if the cosine of the angle between the
-# tangents exceeds this number.
-FIRST_CORRECTION = 0.3
-TURN = 0.8
-# Largest last correction of a waypoint; a looser goal prevents long strides between bends.
-WAYPOINT_GOAL = 1e-4
-WAYPOINT_RTOL = 1e-9
 # Size below which corrections that no longer shrink are at the limit of rounding.
 STALLED = 1e-6
 # Most corrections of an orbit that is known approximately, and size of the first one; each halves this limit.
@@ -65,8 +51,8 @@ class Transition(NamedTuple):
 
 
 class Orbit(NamedTuple):
-    """Periodic orbit: ``state`` (n,) at t = 0, transition ``matrix`` (n, n) about it, absolute ``error`` of the state
-    (from :func:`shoot`: its last Newton correction) and an ``Outcome``; ``corrections`` counts the Newton steps."""
+    """Periodic orbit: ``state`` (n,) at t = 0, transition ``matrix`` (n, n) about it, its last Newton correction ``error``
+    and an ``Outcome``; ``corrections`` counts the Newton steps."""
 
     state: Array
     matrix: Array
@@ -173,118 +159,6 @@ def _settled(relative: Array, shrunk: Array, rtol: float) -> Array:
     return (relative <= rtol) | ((relative <= STALLED) & ~(shrunk <= 0.1))
 
 
-class _Path(NamedTuple):
-    """State of the loop of :func:`shoot`; points are ``x = (y, lambda)``, shape (n + 1,).
-
-    ``waypoint`` is the last orbit found, ``tangent`` the direction of the path there, ``stride`` the length of the next
-    step along the path, and ``last`` is true if this step ends at lambda = 1. ``point`` is the iterate, ``correction`` its
-    last change, ``count`` the number of changes since the prediction. ``total`` counts all corrections, ``steps`` the steps
-    of their integrations.
-    """
-
-    waypoint: Array
-    tangent: Array
-    stride: Array
-    last: Array
-    point: Array
-    correction: Array
-    count: Array  # pyright: ignore[reportIncompatibleMethodOverride]
-    total: Array
-    matrix: Array
-    found: Array
-    steps: Array | int = 0
-
-
-def shoot(field: Field, response: Array, period: float, rtol: float) -> Orbit:
-    """Periodic orbit of ``y' = field(t, y)`` on the path from rest along growing forcing; failures only set the ``Outcome``.
-
-    The orbits of ``y' = field(t, y) - (1 - lambda) field(t, 0)`` form a path (y, lambda) that starts at (0, 0) in the
-    direction ``(response, 1)``, where ``response`` (n,) is the periodic solution of the forced linear system. The
-    continuation is by arc length, hence around folds, until lambda = 1. If the response is small, the first stride ends
-    there. Newton's method corrects each prediction. A stride is halved if its first correction is not small against the
-    stride, if a later correction exceeds half the previous one, or if the path turns. The iteration thus stays on the path.
-    An orbit that is not on this path is not found. States should be of order one.
-    """
-    n = response.size
-
-    def extended(t: Any, x: Array) -> Array:
-        slope = field(t, x[:n]) - (1 - x[n]) * field(t, jnp.zeros(n))
-        return jnp.append(slope, 0.0)
-
-    def running(s: _Path) -> Array:
-        onwards = (s.last | (s.stride >= SHORTEST_STRIDE)) & (s.waypoint[n] > TURNED_AWAY)
-        return ~s.found & onwards & (s.total < MAX_CORRECTIONS) & (s.steps < MAX_SEARCH)
-
-    def correct(s: _Path) -> _Path:
-        # In a batch the loop runs until the last lane is done: finished lanes integrate over an empty span.
-        span = jnp.where(running(s), period, 0.0)
-        step = transition(extended, s.point, span, jnp.where(s.last, rtol, WAYPOINT_RTOL))
-        # Either lambda is fixed at 1, or the correction is normal to the path.
-        constraint = jnp.where(s.last, jnp.zeros(n + 1).at[n].set(1.0), s.tangent)
-        system = (jnp.eye(n + 1) - step.matrix).at[n].set(constraint)
-        sides = jnp.stack([(step.end - s.point).at[n].set(0.0), jnp.zeros(n + 1).at[n].set(1.0)], axis=1)
-        delta, direction = solve(system, sides).T
-        judged = _judge(s, delta, direction / jnp.linalg.norm(direction), step, rtol)
-        return judged._replace(steps=s.steps + step.steps)
-
-    ahead = jnp.append(response, 1.0)
-    tangent = ahead / jnp.linalg.norm(ahead)
-    stride = jnp.minimum(1 / tangent[n], 1.0 + jnp.sqrt(1.0 * n))
-    first = _predict(jnp.zeros(n + 1), tangent, stride, jnp.zeros((), int), jnp.full((n, n), jnp.nan))
-    first = first._replace(steps=jnp.zeros_like(first.total))
-    s = jax.lax.while_loop(running, correct, first)
-    outcome = jnp.where(s.found, Outcome.SUCCESS, Outcome.NOT_CONVERGED)
-    return Orbit(s.point[:n], s.matrix, s.correction, outcome, s.total)
-
-
-def _predict(waypoint: Array, tangent: Array, stride: Array, total: Array, matrix: Array) -> _Path:
-    """State of the loop at the start of a new stride, which ends at lambda = 1 at the latest."""
-    left = 1 - waypoint[-1]
-    # A stride that almost reaches lambda = 1 ends there.
-    last = stride * tangent[-1] >= (1 - 1e-6) * left
-    stride = jnp.where(last, left / jnp.where(last, tangent[-1], 1.0), stride)
-    point = waypoint + stride * tangent
-    # On the last stride lambda is exactly 1, despite rounding.
-    point = point.at[-1].set(jnp.where(last, 1.0, point[-1]))
-    return _Path(
-        waypoint,
-        tangent,
-        stride,
-        last,
-        point,
-        2 * FIRST_CORRECTION * stride,
-        jnp.zeros((), int),
-        total,
-        matrix,
-        jnp.array(False),
-    )
-
-
-def _judge(s: _Path, delta: Array, direction: Array, step: Transition, rtol: float) -> _Path:
-    """State of the loop after a correction: for another correction, the next stride, or a shorter stride."""
-    point = s.point + delta
-    change = jnp.max(jnp.abs(delta))
-    shrinking = (change <= 0.5 * s.correction) & (direction @ s.tangent >= TURN)
-    sound = (step.outcome == Outcome.SUCCESS) & jnp.isfinite(change)
-    relative = change / size_of(point[:-1])
-    settled = _settled(relative, change / s.correction, rtol)
-    close = sound & jnp.where(s.last, settled, shrinking & (change <= WAYPOINT_GOAL))
-    n = point.size - 1
-    total, matrix = s.total + 1, step.matrix[:n, :n]
-    # A waypoint beyond lambda = 1 is not kept: it only corrects the direction of the stride to lambda = 1.
-    beyond = point[n] >= 1
-    secant = (point - s.waypoint) / jnp.linalg.norm(point - s.waypoint)
-    waypoint = jnp.where(close & ~beyond, point, s.waypoint)
-    tangent = jnp.where(close, jnp.where(beyond, secant, direction), s.tangent)
-    stride = jnp.where(close, jnp.where(s.count <= 2, 2.0, 1.0), 0.5) * s.stride
-    restart = _predict(waypoint, tangent, stride, total, matrix)
-    onwards = s._replace(
-        point=point, correction=change, count=s.count + 1, total=total, matrix=matrix, found=close & s.last
-    )
-    again = (close & ~s.last) | ~(close | (sound & shrinking))
-    return jax.tree.map(lambda new, same: jnp.where(again, new, same), restart, onwards)
-
-
 class PeriodicSlopes(NamedTuple):
     """Derivatives by the P parameters: of the ``state`` at the start, ``(n, P)``, and of the largest displacements
     ``tops``, ``(k, P)``."""
@@ -350,35 +224,68 @@ def _lifted(field: Parametric, parameters: Any, n: int, size: Array) -> tuple[Ca
     return lifted, scale
 
 
-# Periodic orbits over the speed: their map over a period, and a search for those that coexist at one speed.
+# Approximate orbits by continuation, which Newton's method then corrects.
 
 
-# Ratio of speeds over which the search runs, and orbits kept of each direction.
-REACH, _EACH = 1.3, 3
-# Most steps of the search, its longest step, tolerance of its integrations, and last correction of its points. All are
-# coarse, because Newton's method corrects what is found.
-_ATTEMPTS, _LONGEST, _RTOL, _CONVERGED = 60, 0.1, 1e-5, 1e-3
-# Most steps of an integration of the search: far from any orbit of interest a state may oscillate without limit.
-_STEPS = 256
+# Most steps of a search, tolerance of its integrations, and last correction of its points. All are coarse.
+_ATTEMPTS, _RTOL, _CONVERGED = 60, 1e-5, 1e-3
+# Along growing forcing: longest step, and most steps of an integration. Small orbits are nearly proportional to the forcing.
+_WHOLE, _MOST = 0.5, 4096
+# Along the speed: ratio of speeds over which the search runs, orbits kept of each direction, longest step, and most steps of
+# an integration: far from any orbit of interest a state may oscillate without limit.
+REACH, _EACH, _LONGEST, _STEPS = 1.3, 3, 0.1, 256
 # Most orbits that a point compares: from the path of growing forcing, and from both directions of the search.
 MOST = 1 + 2 * _EACH
 
 
-def speed_map(model_at: Callable[[Any], ForcedModel], x: Array, rtol: float, most: int = _STEPS) -> Mapped:
-    """The map over a period of one lane ``x = (y, speed)``, shape ``(n + 1,)``.
+def mapped(field: Field, x: Array, rtol: float, most: int) -> Mapped:
+    """The map over a period of one lane ``x = (y, p)``, shape ``(n + 1,)``, with ``field(s, x)`` at the fraction s of it.
 
     NaN if the integration fails or needs more than ``most`` steps.
     """
     n = x.size - 1
-
-    def extended(s: Any, x: Array) -> Array:
-        model = model_at(x[n])
-        return jnp.append(model.period * model.field(model.period * s, x[:n]), 0.0)
-
     # Lanes that have ended are NaN: they integrate over an empty span.
-    step = transition(extended, x, jnp.where(jnp.all(jnp.isfinite(x)), 1.0, 0.0), rtol, most)
+    span = jnp.where(jnp.all(jnp.isfinite(x)), 1.0, 0.0)
+    step = transition(lambda s, x: jnp.append(field(s, x), 0.0), x, span, rtol, most)
     end = jnp.where(step.outcome == Outcome.SUCCESS, step.end[:n], jnp.nan)
     return Mapped(end, step.matrix[:n, :n], step.matrix[:n, n], jnp.asarray(step.steps, float))
+
+
+def shoot(field: Field, period: float, n: int, rtol: float) -> Orbit:
+    """Periodic orbit of ``y' = field(t, y)`` on the path from rest along growing forcing; failures only set the ``Outcome``.
+
+    The orbits of ``y' = field(t, y) - (1 - lambda) field(t, 0)`` form a path (y, lambda) that starts at (0, 0). The
+    continuation runs through folds until lambda = 1; Newton's method corrects the orbit there. An orbit that is not on this
+    path is not found. States should be of order one.
+    """
+
+    def forced(s: Any, x: Array) -> Array:
+        return period * (field(period * s, x[:n]) - (1 - x[n]) * field(period * s, jnp.zeros(n)))
+
+    ones, period_map = jnp.ones((n + 1, 1)), jax.vmap(lambda x: mapped(forced, x, _RTOL, _MOST), 1, -1)
+    path = follow(
+        period_map,
+        jnp.zeros((n + 1, 1)),
+        ones,
+        direction=jnp.ones(1),
+        attempts=_ATTEMPTS,
+        longest=_WHOLE,
+        limits=(0.0, 1.0),
+        converged=_CONVERGED,
+        special=False,
+    )
+    guess, exists, _ = sections(course(path.x, ones), jnp.ones(()), 1)
+    return corrected(field, jnp.where(exists[0, 0], guess[0, :n, 0], jnp.nan), period, rtol)
+
+
+def speed_map(model_at: Callable[[Any], ForcedModel], x: Array, rtol: float, most: int = _STEPS) -> Mapped:
+    """The map over a period of one lane ``x = (y, speed)``; see :func:`mapped`."""
+
+    def moving(s: Any, x: Array) -> Array:
+        model = model_at(x[-1])
+        return model.period * model.field(model.period * s, x[:-1])
+
+    return mapped(moving, x, rtol, most)
 
 
 def neighbours(model_at: Callable[[Any], ForcedModel], speed: Array, n: int) -> Array:
