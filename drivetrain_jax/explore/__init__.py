@@ -243,8 +243,7 @@ def _resonances(atlas: Atlas, system: type[System]) -> dict[str, Any] | None:
     }
     speeds = np.broadcast_to(predicted.values(values), (len(t), len(predicted.labels)))
     tensor = coefficients(speeds, degrees) if varied else speeds
-    families = sorted(predicted.families, key=lambda family: -len(family.prefix))
-    kinds = [next((f for f in families if label.startswith(f.prefix)), None) for label in predicted.labels]
+    kinds = [predicted.family(label) for label in predicted.labels]
     return {
         "axis": predicted.axis,
         "labels": list(predicted.labels),

@@ -17,9 +17,9 @@ from jax import Array
 
 from drivetrain_jax.analysis._base import Outcome
 from drivetrain_jax.analysis.frequency_response import describing_function
-from drivetrain_jax.analysis.frequency_response.describing_function import bisect, follow, refined, take
+from drivetrain_jax.analysis.frequency_response.describing_function import follow, refined, take
 from drivetrain_jax.analysis.impacts.motion import ABSENT, imbalance, regime
-from drivetrain_jax.analysis.numerics.continuation import sign_changes
+from drivetrain_jax.analysis.numerics.continuation import bisect, sign_changes
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 # First-order multiple scales (= averaging) of the oscillator with play, with a cubic polynomial for its spring.

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.numerics.continuation import first_marks, sign_changes
+from drivetrain_jax.analysis.numerics.continuation import bisect, first_marks, sign_changes
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 # Stationary amplitudes of one-term approximations: all amplitudes at a frequency, and those of a slow sweep.
@@ -48,19 +48,6 @@ def refined(omega: np.ndarray, largest: float, most: int) -> tuple[np.ndarray, n
     pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(rising[:-1], rising[1:], parts, strict=True)]
     fine = np.concatenate([*pieces, rising[-1:]])
     return fine, np.searchsorted(fine, omega)
-
-
-def bisect(function: Callable[[Array], Array], low: Array, high: Array, halvings: int = 60) -> Array:
-    """The point between ``low`` and ``high`` at which ``function`` becomes positive."""
-
-    def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = bracket
-        middle = (low + high) / 2
-        above = function(middle) > 0
-        return jnp.where(above, low, middle), jnp.where(above, middle, high)
-
-    low, high = jax.lax.fori_loop(0, halvings, halve, (low, high))
-    return (low + high) / 2
 
 
 def take(mask: Array, values: Array, missing: float = np.nan) -> Array:

@@ -308,6 +308,19 @@ def folds_and_doublings(
 # where it turns back in frequency, so that the motions on both sides of a fold are found.
 
 
+def bisect(function: Callable[[Array], Array], low: Array, high: Array, halvings: int = 60) -> Array:
+    """The point between ``low`` and ``high`` at which ``function`` becomes positive."""
+
+    def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bracket
+        middle = (low + high) / 2
+        above = function(middle) > 0
+        return jnp.where(above, low, middle), jnp.where(above, middle, high)
+
+    low, high = jax.lax.fori_loop(0, halvings, halve, (low, high))
+    return (low + high) / 2
+
+
 def sign_changes(positive: Array, count: int) -> Array:
     """Mask ``(count, K - 1, ...)`` of the interval with the n-th change of sign along the first axis."""
     return first_marks(positive[1:] != positive[:-1], count)
@@ -395,14 +408,12 @@ def sections(branch: Course, omega: Array, count: int) -> tuple[Array, Array, Ar
     low, high = jnp.where(second, cut, 0.0), jnp.where(second, 1.0, cut)
     start = jnp.take_along_axis(branch.nodes, place, axis=0) > omega
 
-    def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = bracket
-        middle = (low + high) / 2
-        here = _cubic((ends[0][:, -1], ends[1][:, -1]), (slopes[0][:, -1], slopes[1][:, -1]), middle) > omega
-        return jnp.where(here == start, middle, low), jnp.where(here == start, high, middle)
+    def passed(part: Array) -> Array:
+        here = _cubic((ends[0][:, -1], ends[1][:, -1]), (slopes[0][:, -1], slopes[1][:, -1]), part) > omega
+        return (here != start).astype(int)
 
-    low, high = jax.lax.fori_loop(0, _SECTION_HALVINGS, halve, (low, high))
-    places = _cubic(ends, slopes, ((low + high) / 2)[:, None])  # pyright: ignore[reportArgumentType]
+    part = bisect(passed, low, high, _SECTION_HALVINGS)
+    places = _cubic(ends, slopes, part[:, None])  # pyright: ignore[reportArgumentType]
     return jnp.where(exists[:, None], places, 0.0), exists, every
 
 
