@@ -86,14 +86,15 @@ def _on_plane(period_map: PeriodMap, guess: Array, normal: Array, scale: Array, 
 
     def correct(state: tuple[Array, _Solved]) -> tuple[Array, _Solved]:
         count, old = state
-        image = period_map(old.x)
+        open_ = old.change > converged
+        # Lanes that have converged do not move.
+        image = period_map(jnp.where(open_, old.x, jnp.nan))
         ahead = jnp.sum(normal * (guess - old.x) / scale, axis=0)
         right = jnp.concatenate([(old.x[:-1] - image.end) / scale[:-1], ahead[None]])
         system = _bordered(image.matrix, image.slope, normal, scale)
         step, along = jnp.moveaxis(solve(system, jnp.stack([right, last], axis=1)), 1, 0)
         tangent = along / jnp.sqrt(jnp.sum(along**2, axis=0))
         change = jnp.max(jnp.abs(step), axis=0)
-        open_ = old.change > converged
         new = _Solved(old.x + step * scale, image.matrix, tangent, old.corrections + 1, change, old.steps + image.steps)
         return count + 1, jax.tree.map(lambda a, b: jnp.where(open_, a, b), new, old)
 
