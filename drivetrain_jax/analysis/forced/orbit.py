@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from drivetrain_jax.analysis._base import Outcome
-from drivetrain_jax.analysis.numerics.continuation import Mapped, course, follow, sections
+from drivetrain_jax.analysis.numerics.continuation import Mapped, PeriodMap, course, follow, sections
 from drivetrain_jax.analysis.numerics.linear_algebra import solve
 from drivetrain_jax.systems import ForcedModel
 
@@ -238,17 +238,29 @@ REACH, _EACH, _LONGEST, _STEPS = 1.3, 3, 0.1, 256
 MOST = 1 + 2 * _EACH
 
 
-def mapped(field: Field, x: Array, rtol: float, most: int) -> Mapped:
-    """The map over a period of one lane ``x = (y, p)``, shape ``(n + 1,)``, with ``field(s, x)`` at the fraction s of it.
+def period_map(field: Field, rtol: float, most: int) -> PeriodMap:
+    """The map of lanes ``x = (y, p)`` over a period, with ``field(s, x)`` at the fraction s of it.
 
     NaN if the integration fails or needs more than ``most`` steps.
     """
-    n = x.size - 1
-    # Lanes that have ended are NaN: they integrate over an empty span.
-    span = jnp.where(jnp.all(jnp.isfinite(x)), 1.0, 0.0)
-    step = transition(lambda s, x: jnp.append(field(s, x), 0.0), x, span, rtol, most)
-    end = jnp.where(step.outcome == Outcome.SUCCESS, step.end[:n], jnp.nan)
-    return Mapped(end, step.matrix[:n, :n], step.matrix[:n, n], jnp.asarray(step.steps, float))
+
+    def one(x: Array) -> Mapped:
+        n = x.size - 1
+        # Lanes that have ended are NaN: they integrate over an empty span.
+        span = jnp.where(jnp.all(jnp.isfinite(x)), 1.0, 0.0)
+        step = transition(lambda s, x: jnp.append(field(s, x), 0.0), x, span, rtol, most)
+        end = jnp.where(step.outcome == Outcome.SUCCESS, step.end[:n], jnp.nan)
+        return Mapped(end, step.matrix[:n, :n], step.matrix[:n, n], jnp.asarray(step.steps, float))
+
+    return jax.vmap(one, 1, -1)
+
+
+def _guesses(lanes_map: PeriodMap, x: Array, scale: Array, at: Array, count: int, **search: Any) -> Array:
+    """Up to ``count`` approximate orbits at the parameter ``at`` on each branch from ``x``, ``(count, n, N)``, NaN if
+    missing; ``search``: further arguments of :func:`follow`."""
+    branch = follow(lanes_map, x, scale, attempts=_ATTEMPTS, converged=_CONVERGED, special=False, **search)
+    guess, exists, _ = sections(course(branch.x, scale), at, count)
+    return jnp.where(exists[:, None], guess, jnp.nan)[:, :-1]
 
 
 def shoot(field: Field, period: float, n: int, rtol: float) -> Orbit:
@@ -262,30 +274,20 @@ def shoot(field: Field, period: float, n: int, rtol: float) -> Orbit:
     def forced(s: Any, x: Array) -> Array:
         return period * (field(period * s, x[:n]) - (1 - x[n]) * field(period * s, jnp.zeros(n)))
 
-    ones, period_map = jnp.ones((n + 1, 1)), jax.vmap(lambda x: mapped(forced, x, _RTOL, _MOST), 1, -1)
-    path = follow(
-        period_map,
-        jnp.zeros((n + 1, 1)),
-        ones,
-        direction=jnp.ones(1),
-        attempts=_ATTEMPTS,
-        longest=_WHOLE,
-        limits=(0.0, 1.0),
-        converged=_CONVERGED,
-        special=False,
-    )
-    guess, exists, _ = sections(course(path.x, ones), jnp.ones(()), 1)
-    return corrected(field, jnp.where(exists[0, 0], guess[0, :n, 0], jnp.nan), period, rtol)
+    search: dict[str, Any] = {"direction": jnp.ones(1), "longest": _WHOLE, "limits": (0.0, 1.0)}
+    rest, unit = jnp.zeros((n + 1, 1)), jnp.ones((n + 1, 1))
+    guess = _guesses(period_map(forced, _RTOL, _MOST), rest, unit, jnp.ones(()), 1, **search)
+    return corrected(field, guess[0, :, 0], period, rtol)
 
 
-def speed_map(model_at: Callable[[Any], ForcedModel], x: Array, rtol: float, most: int = _STEPS) -> Mapped:
-    """The map over a period of one lane ``x = (y, speed)``; see :func:`mapped`."""
+def speed_map(model_at: Callable[[Any], ForcedModel], rtol: float, most: int) -> PeriodMap:
+    """The map of lanes ``x = (y, speed)`` over a period; see :func:`period_map`."""
 
     def moving(s: Any, x: Array) -> Array:
         model = model_at(x[-1])
         return model.period * model.field(model.period * s, x[:-1])
 
-    return mapped(moving, x, rtol, most)
+    return period_map(moving, rtol, most)
 
 
 def neighbours(model_at: Callable[[Any], ForcedModel], speed: Array, n: int) -> Array:
@@ -297,16 +299,7 @@ def neighbours(model_at: Callable[[Any], ForcedModel], speed: Array, n: int) -> 
     far = speed * jnp.array([1 / REACH, REACH])
     x = jnp.concatenate([jnp.zeros((n, 2)), far[None]])
     scale = jnp.concatenate([jnp.ones((n, 2)), jnp.full((1, 2), speed)])
-    branch = follow(
-        jax.vmap(lambda x: speed_map(model_at, x, _RTOL), 1, -1),
-        x,
-        scale,
-        direction=jnp.array([1.0, -1.0]),
-        attempts=_ATTEMPTS,
-        longest=_LONGEST,
-        limits=(far[0] * (1 - 1e-9), far[1] * (1 + 1e-9)),
-        converged=_CONVERGED,
-        special=False,
-    )
-    guess, exists, _ = sections(course(branch.x, scale), speed, _EACH)
-    return jnp.where(exists[:, None], guess, jnp.nan)[:, :n].transpose(0, 2, 1).reshape(-1, n)
+    search: dict[str, Any] = {"direction": jnp.array([1.0, -1.0]), "longest": _LONGEST}
+    search |= {"limits": (far[0] * (1 - 1e-9), far[1] * (1 + 1e-9))}
+    guess = _guesses(speed_map(model_at, _RTOL, _STEPS), x, scale, speed, _EACH, **search)
+    return guess.transpose(0, 2, 1).reshape(-1, n)

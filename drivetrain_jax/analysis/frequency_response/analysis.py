@@ -131,7 +131,7 @@ def _branches_of_orbits(
     at = jnp.asarray(np.tile(starts, 2))
     x = jnp.concatenate([jnp.zeros((n, at.size)), at[None]])
     scale = jnp.concatenate([jnp.ones((n, at.size)), at[None]])
-    mapped = jax.vmap(lambda x: speed_map(model_at, x, _RTOL, _STEPS), 1, -1)
+    mapped = speed_map(model_at, _RTOL, _STEPS)
     branch = follow(
         mapped,
         x,
