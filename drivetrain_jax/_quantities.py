@@ -155,6 +155,11 @@ class Parameter:
         return f'; did you mean "{value:.10g} deg"?'
 
 
+def count(name: str, long_name: str, **rest: Any) -> Parameter:
+    """A parameter that is an integer without a unit."""
+    return Parameter(name, "1", long_name, integer=True, **rest)
+
+
 @dataclass(frozen=True)
 class Component:
     """A component of the state of a system; ``symbol`` is its form in figures, by default made of the name.

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax._quantities import Dimension, Parameter, Variable, count
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.impacts.attractor import attractors, take
 from drivetrain_jax.analysis.impacts.exact_response import WIDTH, describe
@@ -42,8 +42,8 @@ VARIABLES = (
     ),
 )
 OPTIONS = (
-    Parameter("samples", "1", "number of initial states", default=1024, lower=1, upper=1e6, integer=True),
-    Parameter("seed", "1", "seed of the generator", default=0, lower=0, upper=2**32 - 1, integer=True),
+    count("samples", "number of initial states", default=1024, lower=1, upper=1e6),
+    count("seed", "seed of the generator", default=0, lower=0, upper=2**32 - 1),
     Parameter("reach_u", "m", "half the range of the initial displacement", default=1.0, lower=0.0),
     Parameter("reach_v", "m/s", "half the range of the initial velocity", default=1.0, lower=0.0),
     WAIT,

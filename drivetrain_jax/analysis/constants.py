@@ -14,12 +14,12 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax._quantities import Dimension, Parameter
+from drivetrain_jax._quantities import Dimension, count
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver, forward_derivatives
 from drivetrain_jax.systems import System
 
 MODE = "mode"
-_MODES = Parameter("modes", "1", "number of modes", default=5, lower=1, upper=1000, integer=True)
+_MODES = count("modes", "number of modes", default=5, lower=1, upper=1000)
 
 
 def _solve(

@@ -20,7 +20,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax._quantities import Dimension, Parameter, Variable, count
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.modes import described, is_rigid, largest_frequency, system_modes
 from drivetrain_jax.analysis.numerics.lanes import lane_count
@@ -88,7 +88,7 @@ ANALYSIS = Analysis(
     options=(
         Parameter("start", "Hz", "lowest frequency", default=1.0, lower=0.0, upper=1e9),
         Parameter("stop", "Hz", "highest frequency", default=0.0, lower=0.0, upper=1e9),
-        Parameter("num", "1", "number of frequencies", default=1001, lower=2, upper=1e5, integer=True),
+        count("num", "number of frequencies", default=1001, lower=2, upper=1e5),
         Parameter("damping_ratio", "1", "damping ratio of every mode", default=0.02, lower=0.0),
     ),
     solvers=_solvers,

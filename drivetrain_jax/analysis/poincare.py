@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax._quantities import Dimension, Parameter, Variable, count
 from drivetrain_jax.analysis._base import MOST_STEPS, Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.history.integration import has_finite_start
 from drivetrain_jax.analysis.lyapunov.growth_record import discarded, sampled
@@ -163,9 +163,9 @@ VARIABLES = (
     Variable("section_error", "1", "estimated error of the section since the start, over the largest value"),
 )
 OPTIONS = (
-    Parameter("strobes", "1", "points of the section", default=5000, lower=128, upper=1e7, integer=True),
-    Parameter("discard", "1", "strobes before the first point", default=5000, lower=0, upper=1e9, integer=True),
-    Parameter("steps", "1", "integration steps per strobe", default=48, lower=4, upper=1e6, integer=True),
+    count("strobes", "points of the section", default=5000, lower=128, upper=1e7),
+    count("discard", "strobes before the first point", default=5000, lower=0, upper=1e9),
+    count("steps", "integration steps per strobe", default=48, lower=4, upper=1e6),
     Parameter("rtol", "1", "relative tolerance of a step", default=1e-3, lower=1e-14, upper=1e-1),
     Parameter("atol", "1", "absolute tolerance of a step", default=1e-6, lower=0.0, open_lower=True),
 )

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax._quantities import Dimension, Variable, count
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver, stacked
 from drivetrain_jax.analysis.impacts.attractor import attractors
 from drivetrain_jax.analysis.impacts.exact_response import INTEGRALS, WIDTH, describe, periodic_results
@@ -134,9 +134,7 @@ VARIABLES = (
     Variable("v_history", "m/s", "relative velocity", ("sample",)),
     Variable("periods_settled", "1", "drive periods until the attractor was recognised", dtype="int32"),
 )
-WAIT = Parameter(
-    "most_periods", "1", "largest number of drive periods of a motion", default=4000, lower=64, upper=1e8, integer=True
-)
+WAIT = count("most_periods", "largest number of drive periods of a motion", default=4000, lower=64, upper=1e8)
 # Points per chunk: so many that the lanes are busy until the queue is nearly empty.
 _CHUNK = 4096
 

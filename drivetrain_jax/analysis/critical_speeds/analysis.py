@@ -31,7 +31,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax._quantities import Dimension, Parameter, Variable, count
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver
 from drivetrain_jax.analysis.critical_speeds import frequency_roots as shaft_roots
 from drivetrain_jax.analysis.critical_speeds.frequency_roots import Roots, frequency_derivatives
@@ -88,16 +88,14 @@ VARIABLES = (
     Variable("mode_shape", "1", "deflection of the mode, largest +1", ("mode", "x")),
 )
 OPTIONS = (
-    Parameter("modes", "1", "number of modes, zero modes included", default=6, lower=1, upper=1000, integer=True),
-    Parameter("stations", "1", "number of points of a mode shape", default=101, lower=2, upper=10001, integer=True),
-    Parameter(
+    count("modes", "number of modes, zero modes included", default=6, lower=1, upper=1000),
+    count("stations", "number of points of a mode shape", default=101, lower=2, upper=10001),
+    count(
         "order",
-        "1",
         "order of the excitation, < 0: backward (0: at rest, in the first plane)",
         default=0,
         lower=-100,
         upper=100,
-        integer=True,
     ),
     Parameter("operating_min", "rpm", "lowest operating speed", default=0.0, lower=0.0),
     Parameter("operating_max", "rpm", "highest operating speed (0: not given)", default=0.0, lower=0.0),

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax._quantities import Dimension, Variable, count
 from drivetrain_jax.analysis._base import Analysis, Request, Solver
 from drivetrain_jax.analysis.critical_speeds import coupled
 from drivetrain_jax.analysis.critical_speeds.analysis import Build, outcomes
@@ -49,7 +49,7 @@ VARIABLES = (
         "int8",
     ),
 )
-OPTIONS = (Parameter("modes", "1", "number of modes of both directions", default=8, lower=1, upper=1000, integer=True),)
+OPTIONS = (count("modes", "number of modes of both directions", default=8, lower=1, upper=1000),)
 
 
 def _whirl(shaft: Shaft, modes: int) -> tuple[Roots, Array]:

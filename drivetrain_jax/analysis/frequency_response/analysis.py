@@ -26,7 +26,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax._quantities import Dimension, Parameter, Variable, count
 from drivetrain_jax._rules import BUILT_IN
 from drivetrain_jax.analysis._base import RTOL, Analysis, Outcome, Request, Solver, finite_results
 from drivetrain_jax.analysis.forced.analysis import NEAR, SAME, STABLE_MARGIN, distinct, orbits_near
@@ -185,26 +185,10 @@ VARIABLES = (
 )
 OPTIONS = (
     RTOL,
-    Parameter(
-        "most_periods",
-        "1",
-        "largest number of drive periods until a motion settles",
-        default=1000,
-        lower=32,
-        upper=1e6,
-        integer=True,
-    ),
-    Parameter("harmonics", "1", "harmonics of the drive's frequency", default=15, lower=1, upper=200, integer=True),
-    Parameter("subharmonic", "1", "order of the subharmonics kept", default=1, lower=1, upper=8, integer=True),
-    Parameter(
-        "samples",
-        "1",
-        "samples per period of the drive, 0: by the harmonics",
-        default=0,
-        lower=0,
-        upper=1e5,
-        integer=True,
-    ),
+    count("most_periods", "largest number of drive periods until a motion settles", default=1000, lower=32, upper=1e6),
+    count("harmonics", "harmonics of the drive's frequency", default=15, lower=1, upper=200),
+    count("subharmonic", "order of the subharmonics kept", default=1, lower=1, upper=8),
+    count("samples", "samples per period of the drive, 0: by the harmonics", default=0, lower=0, upper=1e5),
     Parameter("fit_range", "m", "range R of the cubic fit (0: its own peak amplitude)", default=0.0, lower=0.0),
 )
 METHODS = {

@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax._quantities import Dimension, Parameter, Variable, count
 from drivetrain_jax.analysis._base import (
     DIFFRAX_SOLVERS,
     MOST_SECONDS,
@@ -69,7 +69,7 @@ _PLAY_TITLES = {
     "slow_flow": "averaged equations of amplitude and phase (multiple scales give the same)",
 }
 _PLAY_OPTIONS = (
-    Parameter("most_events", "1", "length of the list of events", default=256, lower=1, upper=1e6, integer=True),
+    count("most_events", "length of the list of events", default=256, lower=1, upper=1e6),
     Parameter("fit_range", "m", "range R of the cubic fit (0: its own peak amplitude)", default=0.0, lower=0.0),
 )
 _FLANKS = ("drive", "back", "none")

@@ -11,13 +11,11 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._quantities import Parameter
+from drivetrain_jax._quantities import count
 from drivetrain_jax.analysis._base import Request
 from drivetrain_jax.systems import Flow
 
-NUM = Parameter(
-    "num", "1", "number of equally spaced times from 0 to stop", default=1001, lower=2, upper=1e7, integer=True
-)
+NUM = count("num", "number of equally spaced times from 0 to stop", default=1001, lower=2, upper=1e7)
 
 # Tolerance of the steps over rtol, ratio of the coarser run, and tightest tolerance. Tight, because errors of steps
 # accumulate over the memory of the damped motion.
