@@ -145,7 +145,7 @@ _file, _given = partial(_argument, type=path), partial(_argument, "given", "name
 _JSON = "--json", {"action": "store_true", "help": "as one JSON object"}
 _ATLAS = _file("file", "FILE.nc", 'result of a scene with analysis = "atlas"')
 _DATA = _file(
-    "--data", "TABLE", "table of parameters (.csv, .xlsx), a column each: length [mm]; given values override it"
+    "--data", "TABLE", "table of parameters (.csv, .xlsx, .toml), a column each: length [mm]; given values override it"
 )
 _AMPLITUDE = _argument(
     "--amplitude", "LIMIT", 'limit of the forced amplitude ("2 deg"), to compare the forced motion with'

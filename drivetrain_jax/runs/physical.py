@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -181,11 +182,11 @@ _HEADER = re.compile(r"\s*(.+?)\s*(?:[\[(]\s*(.*?)\s*[\])])?\s*")
 
 
 def read_table(path: Path) -> dict[str, Any]:
-    """The parameters in the CSV or XLSX file ``path``: a value or a list by name, ``"60 mm"`` in the unit of the header.
+    """The parameters in the CSV, XLSX or TOML file ``path``: a value or a list by name, ``"60 mm"`` in the unit of the header.
 
     The first row holds ``name [unit]`` or ``name (unit)``; empty cells below a column are left out, and so are columns
-    without a name and the column ``part``, which names the rows. Raises :class:`InputError` for a file that is no such
-    table.
+    without a name and the column ``part``, which names the rows. TOML has a table ``[[part]]`` with a ``name`` for each row.
+    Raises :class:`InputError` for a file that is no such table.
     """
     rows = _rows(path).dropna(how="all")
     columns: dict[str, Any] = {}
@@ -229,6 +230,9 @@ def _rows(path: Path) -> pd.DataFrame:
     try:
         if kind == ".xlsx":
             return pd.read_excel(path, **how)
+        if kind == ".toml":
+            parts = pd.DataFrame(tomllib.loads(path.read_text("utf-8"))[_NAMES]).rename(columns={"name": _NAMES})
+            return pd.DataFrame([parts.columns, *parts.to_numpy()]).map(lambda x: x if pd.isna(x) else str(x))
         if kind == ".csv":
             # Spreadsheets write a byte order mark, and semicolons where the comma is a decimal mark.
             first = path.read_text("utf-8-sig").partition("\n")[0]
@@ -238,5 +242,6 @@ def _rows(path: Path) -> pd.DataFrame:
     # Readers raise exceptions of zip files, XML and their own for a damaged file.
     except Exception as error:
         kinds = {".csv": "CSV in UTF-8 with a value a column, numbers with a decimal point", ".xlsx": "a workbook"}
+        kinds[".toml"] = f"tables [[{_NAMES}]] with the same keys"
         raise _wrong_table(path, clipped(getattr(error, "strerror", None) or str(error)), kinds[kind]) from None
-    raise _wrong_table(path, "not a table", "a file that ends in .csv or .xlsx")
+    raise _wrong_table(path, "not a table", "a file that ends in .csv, .xlsx or .toml")

@@ -213,7 +213,7 @@ def point(
         outputs: results to compute; default: those of the analysis.
         amplitude: limit of the forced amplitude (``"2 deg"``), with which the answer compares the forced motion.
         sensitivities: adds those of the spectral radius, by the given physical data or the parameters.
-        data: a table of parameters (``.csv``, ``.xlsx``), a column each with its unit (``length [mm]``).
+        data: a table of parameters (``.csv``, ``.xlsx``, ``.toml``), a column each with its unit (``length [mm]``).
         given: parameters of the system (or its physical data), and options of the analysis (``method``, ``rtol``, ...);
             they override ``data``.
 

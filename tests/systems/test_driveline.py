@@ -419,6 +419,28 @@ def test_a_table_of_parts_is_a_driveline(tmp_path):
     assert found.crossings["order 2 (joints)"][1] == pytest.approx(30 * first, rel=1e-12)
 
 
+def test_a_table_of_parts_may_be_toml(tmp_path):
+    """One table a part, with a name and values with units; a part without a value is refused as an empty cell is."""
+    paths = [tmp_path / f"truck.{kind}" for kind in ("csv", "toml")]
+    paths[0].write_text(TRUCK)
+    header, *parts = (line.split(",") for line in TRUCK.splitlines())
+    lines = []
+    for part in parts:
+        lines += ["[[part]]", f'name = "{part[0]}"']
+        for column, cell in zip(header[1:], part[1:], strict=True):
+            name, _, unit = column.partition(" [")
+            text = f'"{float(cell)} {unit[:-1]}"' if unit else f'"{cell}"' if "/" in cell else cell
+            lines.append(f"{name} = {text}")
+    paths[1].write_text("\n".join(lines))
+    assert read_table(paths[1]) == read_table(paths[0])
+    paths[1].write_text("\n".join(line for line in lines if line != 'c = "0.5 N m s/rad"'))
+    with pytest.raises(dt.InputError, match="column c has an empty cell between values"):
+        read_table(paths[1])
+    paths[1].write_text("k = 3")
+    with pytest.raises(dt.InputError, match=r"expected tables \[\[part\]\]"):
+        read_table(paths[1])
+
+
 def test_predicted_resonances_are_sums_of_the_frequencies_of_modes():
     case = CASES["ref6"]
     found = driveline_resonances(2)
