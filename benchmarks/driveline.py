@@ -19,7 +19,7 @@ from benchmarks.measure import Job, Judged, Method, Study, columns_scene, engine
 from tests.oracles.cardan_reference import spectral_radius
 from tests.oracles.driveline_reference import multipliers
 
-REGION, COUNT, CHECKED = "three joints, six inertias", 512, 2
+REGION, COUNT, CHECKED = "three joints, six inertias", 30_000, 2
 CHAIN: dict[str, Any] = {
     "k": [3e5, 8e4, 5e4, 6e4, 4e4, 9e4], "c": [20.0, 8.0, 5.0, 5.0, 4.0, 9.0], "J": [12.0, 0.8, 0.3, 0.25, 0.2, 1.5],
     "beta": [0.0, 0.1, 0.12, 0.08, 0.0, 0.0], "phase": [0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.0], "ratio": [1.0] * 6,

@@ -141,8 +141,9 @@ def _variables(atoms: Iterable[Any]) -> set[Var]:
 STAGES, ORDER = 5, 10
 # Lanes per block: with 8 or 16 the compiler unrolls to scalar code, and the data of 64 leave the innermost cache.
 LANES = 32
-# Unknowns of a node, and states, beyond which the compiler of jax 0.10.2 fails on one kernel with all of a march.
-_SMALL, _FEW = 6, 8
+# Unknowns of a node, and states, beyond which the compiler of jax 0.10.2 fails on one kernel with all of a march; and states
+# of a chain, beyond which it shares products among threads.
+_SMALL, _FEW, _LONG = 6, 8, 12
 # Most doublings of the predicted number of panels, and most panels.
 _MAX_REFINEMENTS, MAX_PANELS = 6, 2**19
 # Gauss schemes of s stages turn a decay by exp(-D), if it is fast, into a decay by exp(-2 s (s + 1) n^2/D) in n panels.
@@ -307,7 +308,8 @@ def _by_blocks(compute: Callable[..., Any], fixed: Constants, arrays: LinearPeri
 
         return jax.lax.map(block, packed)
 
-    small = [(march.chain and compute is _agreeing) or (march.d <= _SMALL and march.size <= _FEW) for march in marches]
+    most = [_LONG if march.chain and compute is _agreeing else _FEW for march in marches]
+    small = [march.size <= n and march.d <= _SMALL for n, march in zip(most, marches, strict=True)]
     in_one = all(small) and all(march.suits for march in marches)
     mark = in_one_kernel if in_one else lambda function: function
     return jax.tree.map(lambda x: blocks_joined(x, lanes), mark(all_blocks)(shared, packed))
