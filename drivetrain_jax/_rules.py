@@ -278,17 +278,8 @@ BUILT_IN = {
         # NaN is allowed: the dimensions of branches and folds are longer than most points need, a motion at rest has no
         # phase, and some frequencies have no backbone.
         gaps=(
-            "phase",
-            "branch_u_max",
-            "branch_u_min",
-            "branch_amplitude",
-            "branch_spectral_radius",
-            "fold_frequency",
-            "doubling_frequency",
-            "backbone_amplitude",
-            "peak_amplitude",
-            "peak_frequency",
-            "spectral_radius",
+            *("phase", "branch_u_max", "branch_u_min", "branch_amplitude", "branch_spectral_radius", "fold_frequency"),
+            *("doubling_frequency", "backbone_amplitude", "peak_amplitude", "peak_frequency", "spectral_radius"),
             "state_error",
         ),
         kept=("fit_range",),

@@ -107,6 +107,7 @@ DIMENSIONS = (
     Dimension("sample", "part of the motion's period", tuple(k / SAMPLES for k in range(SAMPLES))),
 )
 HISTORIES = frozenset(("u_history", "v_history"))
+_CONTACT = "(b = 0: always, with the flank loaded by B0)"
 _WHOLE = "over the period of the orbit (non-periodic: over 32 drive periods)"
 _AVERAGED = "(non-periodic: of this motion, mean over the last three quarters of most_periods)"
 VARIABLES = (
@@ -122,12 +123,7 @@ VARIABLES = (
     Variable("regime", "1", REGIME, dtype="int8", flags=REGIMES),
     Variable("impacts", "1", f"number of times that a flank is reached {_WHOLE}", ("flank",)),
     Variable("impact_velocity", "m/s", "largest velocity at which a flank is reached", ("flank",)),
-    Variable(
-        "contact_fraction",
-        "1",
-        "fraction of the time in contact (b = 0: always, with the flank loaded by B0)",
-        ("flank",),
-    ),
+    Variable("contact_fraction", "1", f"fraction of the time in contact {_CONTACT}", ("flank",)),
     Variable("orbit_state", "m, m/s", "state at the start of a drive period", ("state",)),
     Variable("state_error", "m", "estimated absolute error of the orbit's displacement"),
     Variable("u_history", "m", "relative displacement", ("sample",)),

@@ -308,21 +308,13 @@ def rotational_springs(values: Values) -> SpringSystem:
     identity = jnp.broadcast_to(np.eye(3 + n).reshape(3 + n, 3 + n, *(1,) * len(lanes)), (3 + n, 3 + n, *lanes))
     mean = orthonormal_frame(jnp.sqrt(p["I_p"])[:, None])[0]
     family = np.array([ROTATIONAL] * 4 + [PLANET] * (n - 1))
-    factor = weighted_factor(extensions, stiffness(n), mass(n))
+    k, m = stiffness(n), mass(n)
+    factor = weighted_factor(extensions, k, m)
     whole = Block(factor, family, np.zeros(3 + n, bool), identity[:, :, None], identity.at[3:, 3:].set(mean))
     blocks = _rotational_blocks(p, stiffness, mass) if identical_planets(values) else (whole,)
     names = (*(f"u_{body}" for body in "crs"), *(f"u_{i + 1}" for i in range(n)))
     return SpringSystem(
-        extensions,
-        stiffness(n),
-        mass(n),
-        blocks,
-        whole,
-        _inequality(p),
-        names,
-        _body_names(n),
-        np.arange(3 + n),
-        len(FAMILIES),
+        extensions, k, m, blocks, whole, _inequality(p), names, _body_names(n), np.arange(3 + n), len(FAMILIES)
     )
 
 

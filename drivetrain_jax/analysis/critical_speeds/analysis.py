@@ -87,26 +87,15 @@ VARIABLES = (
     Variable("required_margin", "1", "separation margin that API 617 requires for the amplification factor", ("mode",)),
     Variable("mode_shape", "1", "deflection of the mode, largest +1", ("mode", "x")),
 )
+_ORDER = "order of the excitation, < 0: backward (0: at rest, in the first plane)"
+_AMPLIFICATION = "amplification factor at the critical speeds (inf: undamped)"
 OPTIONS = (
     count("modes", "number of modes, zero modes included", default=6, lower=1, upper=1000),
     count("stations", "number of points of a mode shape", default=101, lower=2, upper=10001),
-    count(
-        "order",
-        "order of the excitation, < 0: backward (0: at rest, in the first plane)",
-        default=0,
-        lower=-100,
-        upper=100,
-    ),
+    count("order", _ORDER, default=0, lower=-100, upper=100),
     Parameter("operating_min", "rpm", "lowest operating speed", default=0.0, lower=0.0),
     Parameter("operating_max", "rpm", "highest operating speed (0: not given)", default=0.0, lower=0.0),
-    Parameter(
-        "amplification",
-        "1",
-        "amplification factor at the critical speeds (inf: undamped)",
-        default=math.inf,
-        lower=1.0,
-        infinite=True,
-    ),
+    Parameter("amplification", "1", _AMPLIFICATION, default=math.inf, lower=1.0, infinite=True),
 )
 _OPTION_NAMES = tuple(option.name for option in OPTIONS)
 # Per rad/s.

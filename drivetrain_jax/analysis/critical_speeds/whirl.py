@@ -31,23 +31,12 @@ BACKWARD, PLANAR, FORWARD = range(3)
 # Directions within rounding of 0.
 _PLANAR = 1e-8
 _CHUNK = 256
+_MODE, _SENSES = ("mode",), ("backward", "planar", "forward")
+_CERTIFIED = "whether the count of whirl frequencies below and above certifies the mode"
 VARIABLES = (
-    Variable("whirl_frequency", "rad/s", "whirl frequency", ("mode",)),
-    Variable(
-        "whirl_direction",
-        "1",
-        "direction of whirl, weighted by mass",
-        ("mode",),
-        "int8",
-        flags=("backward", "planar", "forward"),
-    ),
-    Variable(
-        "whirl_count_certified",
-        "1",
-        "whether the count of whirl frequencies below and above certifies the mode",
-        ("mode",),
-        "int8",
-    ),
+    Variable("whirl_frequency", "rad/s", "whirl frequency", _MODE),
+    Variable("whirl_direction", "1", "direction of whirl, weighted by mass", _MODE, "int8", _SENSES),
+    Variable("whirl_count_certified", "1", _CERTIFIED, _MODE, "int8"),
 )
 OPTIONS = (count("modes", "number of modes of both directions", default=8, lower=1, upper=1000),)
 
