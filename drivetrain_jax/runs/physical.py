@@ -182,7 +182,7 @@ _HEADER = re.compile(r"\s*(.+?)\s*(?:[\[(]\s*(.*?)\s*[\])])?\s*")
 
 
 def read_table(path: Path) -> dict[str, Any]:
-    """The parameters in the CSV, XLSX or TOML file ``path``: a value or a list by name, ``"60 mm"`` in the unit of the header.
+    """The parameters in the CSV, XLSX or TOML ``path``: a value or a list by name, ``"60 mm"`` with the unit of the header.
 
     The first row holds ``name [unit]`` or ``name (unit)``; empty cells below a column are left out, and so are columns
     without a name and the column ``part``, which names the rows. TOML has a table ``[[part]]`` with a ``name`` for each row.
