@@ -112,12 +112,13 @@ export function resonances(atlas) {
   };
 }
 
-/** Round numbers between `low` and `high`, about `count` of them. */
+/** Round numbers between `low` and `high`, about `count` of them and at least three. */
 export function ticks(low, high, count) {
   const raw = (high - low) / Math.max(count, 1), power = 10 ** Math.floor(Math.log10(raw));
   const step = [1, 2, 2.5, 5, 10].map((f) => f * power).find((s) => s >= raw * 0.999);
   const found = [];
   for (let i = Math.ceil(low / step - 1e-9); i * step <= high + 1e-9 * step; i++) found.push(i * step);
+  if (found.length < 3 && count < 9) return ticks(low, high, count + 1);
   return { step, values: found };
 }
 

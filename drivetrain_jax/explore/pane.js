@@ -168,10 +168,13 @@ export function drawCursor(app, pane) {
   cross(x, y, theme.accent, [4, 3]);
   if (y !== null) {
     target.setLineDash([]);
-    target.lineWidth = 2;
     target.beginPath();
-    target.arc(x, y, 5, 0, 7);
-    target.stroke();
+    target.arc(x, y, 6, 0, 7);
+    // A white rim shows the point on every colour.
+    for (const [width, style] of [[6, "#ffffff"], [2.5, theme.accent]]) {
+      [target.lineWidth, target.strokeStyle] = [width, style];
+      target.stroke();
+    }
   }
   target.lineWidth = 1;
   if (app.hover) cross(...at(app.hover), theme.muted, []);

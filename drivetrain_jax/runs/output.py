@@ -270,7 +270,7 @@ class Status:
 
     ``failed_by_outcome`` counts the points without a value by outcome; ``remedy`` says what may help those that have not
     converged. ``inaccurate`` points have a value whose error exceeds the target. ``reason`` is the error message that a run
-    would give, empty without one.
+    would give, empty without one. An atlas counts its direct solves, whose ``total`` is 0 before its end (``kind``).
     """
 
     total: int
@@ -281,9 +281,11 @@ class Status:
     reason: str = ""
     remedy: str = ""
     inaccurate: int = 0
+    kind: str = "points"
 
     def __str__(self) -> str:
-        lines = [f"{self.state}: {self.done} of {self.total} points done, {self.failed} without a value"]
+        total = f" of {self.total}" if self.total else ""
+        lines = [f"{self.state}: {self.done}{total} {self.kind} done, {self.failed} without a value"]
         hints = {"not_converged": f" ({self.remedy})" if self.remedy else ""}
         lines += [f"  {name}: {count}{hints.get(name, '')}" for name, count in self.failed_by_outcome.items()]
         lines += [f"  tolerance_not_met: {self.inaccurate}, with a value"] if self.inaccurate else []
@@ -292,7 +294,9 @@ class Status:
     def to_json(self) -> str:
         """The counts, the state and the reason as one JSON object."""
         counts = ("total", "done", "failed")
-        content = {name: x for name, x in vars(self).items() if name in counts or (x and name != "remedy")}
+        content = {
+            name: x for name, x in vars(self).items() if name in counts or (x and name not in ("remedy", "kind"))
+        }
         return json.dumps(content)
 
 
@@ -301,9 +305,10 @@ def status(
 ) -> Status:
     """The :class:`Status` of ``scene`` at ``out``. Changes nothing and compiles nothing."""
     job = resolve(load_scene(scene, overrides))
-    output, total = Output(Path(out), job), 0 if job.scene.analysis.continuous else job.total
+    output, atlas = Output(Path(out), job), job.scene.analysis.continuous
+    total, kind = (0, "direct solves") if atlas else (job.total, "points")
     if output.state == "stale":
-        return Status(total, 0, 0, "stale", reason=f"it {output.reason}")
+        return Status(total, 0, 0, "stale", reason=f"it {output.reason}", kind=kind)
     done, outcomes = None, []
     try:
         if output.state == "complete":
@@ -316,13 +321,13 @@ def status(
             # A run through an atlas has no points before its end.
             outcomes += [results[OUTCOME.name] for _, results in output.finished()]
     except InputError as error:
-        return Status(total, 0, 0, "stale", reason=str(error))
+        return Status(total, 0, 0, "stale", reason=str(error), kind=kind)
     done = sum(codes.size for codes in outcomes) if done is None else done
     counts = {o: sum(int(np.count_nonzero(codes == o)) for codes in outcomes) for o in Outcome}
     without = {o.name.lower(): count for o, count in counts.items() if count and not o.has_value}
     failed, inaccurate = sum(without.values()), counts[Outcome.TOLERANCE_NOT_MET]
     remedy = job.scene.analysis.remedy(job.scene.request)
-    return Status(total or done, done, failed, output.state, without, remedy=remedy, inaccurate=inaccurate)
+    return Status(total or done, done, failed, output.state, without, "", remedy, inaccurate, kind)
 
 
 def open_result(path: str | Path) -> xr.Dataset:

@@ -59,8 +59,9 @@ class Reply:
         return json.dumps(plain({"answer": self.answer, **self.data} if self.answer else self.data), allow_nan=False)
 
     def sentences(self) -> list[str]:
-        """The answer, and the lines below the heading as sentences."""
-        lines = [f"{line.strip()[:1].upper()}{line.strip()[1:]}." for line in self.lines[1:]]
+        """The answer, and the lines below the heading as sentences, details indented."""
+        parts = [("  " * line.startswith("    "), line.strip()) for line in self.lines[1:]]
+        lines = [f"{indent}{text[:1].upper()}{text[1:]}." for indent, text in parts]
         return [self.answer, *lines] if self.answer else lines
 
 
