@@ -25,7 +25,7 @@ from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.consolidate import CONVENTIONS, Entry, Labelled, ResultFile, release
 from drivetrain_jax.store.files import command, flush_tree, move_folder, now, versions
 from drivetrain_jax.store.parts import Arrays, PartsFolder
-from drivetrain_jax.systems import PhysicalData, System
+from drivetrain_jax.systems import PhysicalData
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -46,9 +46,7 @@ class ResultBuffer:
     ``allocate`` returns such arrays for those of :func:`blank` (default: a copy in memory).
     """
 
-    def __init__(
-        self, scene: Scene, grid: Grid, allocate: Callable[[Arrays], Arrays] = lambda blank: _copied(blank)
-    ) -> None:
+    def __init__(self, scene: Scene, grid: Grid, allocate: Callable[[Arrays], Arrays] | None = None) -> None:
         self.variables = result_variables(scene)
         self._scene, self._grid, self._allocate = scene, grid, allocate
         self._unreleased = 0
@@ -83,23 +81,15 @@ class ResultBuffer:
     def lay_out(self, like: Arrays | None = None) -> Arrays:
         """The arrays. Results ``like`` those that fill them give the lengths of dimensions that depend on the system."""
         if not self.arrays:
-            self.arrays = self._allocate(blank(self._scene, self._grid, like))
+            arrays = blank(self._scene, self._grid, like)
+            self.arrays = self._allocate(arrays) if self._allocate else {n: np.array(x) for n, x in arrays.items()}
         return self.arrays
-
-
-def _copied(arrays: Arrays) -> Arrays:
-    return {name: np.array(values) for name, values in arrays.items()}
 
 
 def sweep_first(array: np.ndarray, grid: Grid) -> np.ndarray:
     """``array`` of a result, with a path axis moved behind the other axes of the sweep."""
     position = grid.path_position
     return array if position is None else np.moveaxis(array, position, len(grid.shape))
-
-
-def missing_value(variable: Variable) -> float | int:
-    """The value that marks a missing result of ``variable``."""
-    return Outcome.STEP_LIMIT if variable.name == OUTCOME.name else variable.missing
 
 
 def misfits(layout: Mapping[str, tuple[Any, tuple[int, ...]]], scene: Scene) -> list[str]:
@@ -173,17 +163,6 @@ def axis_coordinates(scene: Scene) -> dict[str, Entry]:
     return coordinates
 
 
-def _drawn(system: type[System]) -> dict[str, Any]:
-    """Attributes that figures need: state, families of resonances, periods of the equations in a turn."""
-    families = system.resonances.families if system.resonances else ()
-    attrs = {
-        "state": [vars(component) for component in system.state],
-        "resonance_families": {f.prefix: {k: v for k, v in vars(f).items() if k != "prefix"} for f in families},
-    }
-    shown = {name: json.dumps(value) for name, value in attrs.items() if value}
-    return shown | ({"periods_per_turn": system.periods_per_turn} if system.periods_per_turn else {})
-
-
 def _finite(value: Any) -> Any:
     """``value`` for JSON, which has no infinity; the word "inf" is read by every parser of numbers."""
     return str(value) if value == math.inf else value
@@ -199,6 +178,15 @@ def result_attrs(scene: Scene) -> dict[str, str]:
     for name, value in scene.data.items():
         quantity = physical.quantity(name)
         data[name] = {"value": value, "units": quantity.units, "long_name": quantity.long_name}
+    # Figures need the state, families of resonances, and periods of the equations in a turn.
+    system = scene.system
+    families = system.resonances.families if system.resonances else ()
+    drawn: dict[str, Any] = {
+        "state": [vars(component) for component in system.state],
+        "resonance_families": {f.prefix: {k: v for k, v in vars(f).items() if k != "prefix"} for f in families},
+    }
+    drawn = {name: json.dumps(value) for name, value in drawn.items() if value}
+    drawn |= {"periods_per_turn": system.periods_per_turn} if system.periods_per_turn else {}
     # An axis given in physical data takes the role of its parameter.
     dim_of = {axis.name: axis.dim for axis in scene.axes if axis.given}
     roles = {role: dim_of.get(name, name) for role, name in scene.system.roles.items()}
@@ -212,7 +200,7 @@ def result_attrs(scene: Scene) -> dict[str, str]:
         **cited,
         "system": scene.system.name,
         "roles": json.dumps(roles),
-        **_drawn(scene.system),
+        **drawn,
         "analysis": scene.analysis.name,
         "method": scene.request.method,
         "options": json.dumps({name: _finite(value) for name, value in scene.request.options.items()}),

@@ -18,8 +18,8 @@ import drivetrain_jax
 from drivetrain_jax import _programs
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax._machine import in_double_precision, threads, usable_cores, use_double_precision
-from drivetrain_jax.analysis import Solver
-from drivetrain_jax.runs.assemble import blank, missing_value
+from drivetrain_jax.analysis import OUTCOME, Outcome, Solver
+from drivetrain_jax.runs.assemble import blank
 from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.kernel import FEW, LIGHT, Kernel, for_device, kernel_of
 from drivetrain_jax.runs.scene import Problem, Scene, result_variables
@@ -179,23 +179,18 @@ class Job:
 
     def joined(self, block: Block, chunks: Sequence[Chunk], results: Sequence[Results]) -> Results:
         """The results of all ``chunks`` of a block in the order of its points; others have no value."""
-        count = len(self.points(block))
+        count, joined = len(self.points(block)), {}
         rows = np.concatenate([np.empty(0, np.int64), *(chunk.rows for chunk in chunks)])
-        shapes = {name: values.shape[1:] for name, values in results[0].items()} if results else self._shapes
-        joined = {}
+        line, outer = (self.grid.path_length,) * (self.grid.path is not None), len(self.grid.result_shape)
+        like = blank(self.problem, self.grid, results[0] if results else None)
         for variable in result_variables(self.problem):
-            shape, blank = (count, *shapes[variable.name]), missing_value(variable)
-            values = np.empty(shape, variable.dtype) if rows.size == count else np.full(shape, blank, variable.dtype)
+            missing = Outcome.STEP_LIMIT if variable.name == OUTCOME.name else variable.missing
+            shape = (count, *line, *like[variable.name].shape[outer:])
+            values = np.empty(shape, variable.dtype) if rows.size == count else np.full(shape, missing, variable.dtype)
             if results:
                 values[rows] = np.concatenate([part[variable.name] for part in results])
             joined[variable.name] = values
         return joined
-
-    @property
-    def _shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shapes of the results of a point or line, without computing one."""
-        line, outer = (self.grid.path_length,) * (self.grid.path is not None), len(self.grid.result_shape)
-        return {n: (*line, *x.shape[outer:]) for n, x in blank(self.problem, self.grid).items()}
 
 
 def _restored(problem: Problem, route: Route, full_size: bool, boxes: Shards) -> Job:

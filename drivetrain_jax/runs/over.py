@@ -127,7 +127,7 @@ def _function_scene(
     if jax.tree_util.treedef_is_leaf(jax.tree.structure(system)):
         raise InputError(f"system: got a {type(system).__name__}; expected a pytree, such as a dict of numbers")
     known = {p.name: p for p in system.parameters} if isinstance(system, System) else {}
-    values = {}
+    values, parameters = {}, []
     if OUTCOME.name in over:
         raise InputError(f"over.{OUTCOME.name}: the name of a result; expected another name")
     for name, entries in over.items():
@@ -138,8 +138,8 @@ def _function_scene(
         table, _ = axis_table(scalar, name, toml.plain(entries), "over", keep=False)
         check_count(f"over.{name}", table, continuous=False)
         values[name] = spread(table, f"over.{name}")
+        parameters.append(Parameter(name, described.units, described.long_name))
     name = re.sub(r"\W", "_", getattr(function, "__name__", "function")).strip("_") or "value"
-
     keywords = {"outputs": outputs} if results and outputs is not None else {}
 
     def one(point: Mapping[str, Any]) -> dict[str, Array]:
@@ -153,7 +153,7 @@ def _function_scene(
     computes = hashlib.blake2b(repr(content).encode(), digest_size=16).hexdigest()
     words = {variable.name: variable for variable in results}
     variables = tuple(words.get(key) or _variable(key, shapes[key]) for key in wanted)
-    kind, analysis = _kind(_Once(one), name, tuple(values), type(system), variables, dims, computes)
+    kind, analysis = _kind(_Once(one), name, tuple(parameters), type(system), variables, dims, computes)
     axes = tuple(Axis(key, kind.parameter(key), None, numbers) for key, numbers in values.items())
     names = [*(axis.dim for axis in axes), *wanted, *dict.fromkeys(dim for v in variables for dim in v.dims)]
     if double := [label for label in names if names.count(label) > 1]:
@@ -174,18 +174,14 @@ class _Once:
 def _kind(
     one: _Once,
     name: str,
-    varies: tuple[str, ...],
+    parameters: tuple[Parameter, ...],
     of: type,
     variables: tuple[Variable, ...],
     dims: tuple[Dimension, ...],
     computes: str,
 ) -> tuple[type[System], Analysis]:
     """A system whose parameters vary, and its analysis; cached, so the same function is compiled once."""
-    known = {p.name: p for p in of.parameters} if issubclass(of, System) else {}
-    described = {}
-    for key in varies:
-        base = known.get(entry_of(key)[0], Parameter(key, "1", key))
-        described[key] = Parameter(key, base.units, base.long_name)
+    varies = tuple(parameter.name for parameter in parameters)
     computing = Parameter(_COMPUTES, "1", "digest of what the function computes", text=True)
 
     def build(values: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -205,7 +201,7 @@ def _kind(
     body = {
         "name": FUNCTION,
         "title": of.__name__,
-        "parameters": (*described.values(), computing),
+        "parameters": (*parameters, computing),
         "models": {name: Model(build, varies)},
     }
     # Analyses ask for them, and figures show them.

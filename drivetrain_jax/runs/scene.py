@@ -296,8 +296,10 @@ def axes_of(
     """The varying parameters; their values are counted before they are computed."""
     if axes and points:
         raise InputError("points: given together with axes; expected one of the two")
-    if analysis.continuous:
-        _check_ranges(axes, points, analysis)
+    if analysis.continuous and points:
+        raise InputError(f"points: {analysis.name} needs ranges; expected axes with start and stop")
+    if analysis.continuous and not 1 <= len(axes) <= MAX_RANGES:
+        raise InputError(f"axes: {len(axes)} are given; {analysis.name} allows 1 to {MAX_RANGES}")
     where = "points" if points else "axes"
     swept = {name: _swept_parameter(system, where, name) for name in axes or points}
     specs = {}
@@ -327,13 +329,6 @@ def axes_of(
             checked(scalar, float(value), "axes.")
         found.append(_axis(name, values, scalar))
     return tuple(found), False
-
-
-def _check_ranges(axes: Mapping[str, Any], points: Mapping[str, Any], analysis: Analysis) -> None:
-    if points:
-        raise InputError(f"points: {analysis.name} needs ranges; expected axes with start and stop")
-    if not 1 <= len(axes) <= MAX_RANGES:
-        raise InputError(f"axes: {len(axes)} are given; {analysis.name} allows 1 to {MAX_RANGES}")
 
 
 def _axis(name: str, values: Any, scalar: Parameter) -> Axis:

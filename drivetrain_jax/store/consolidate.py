@@ -241,9 +241,23 @@ class ResultFile:
 
         Raises ``OSError`` if the disk lacks space, before anything is computed.
         """
-        with naming(self._temporary):
-            places = _write_frame(template, self._temporary, self._preface)
-            with open(self._temporary, "r+b") as file:
+        path, entries = self._temporary, [*template.coords.values(), *template.data.values()]
+        with naming(path):
+            with h5py.File("head", "w", driver="core", backing_store=False, track_order=True, libver=LIBVER) as file:
+                file.flush()
+                preface = self._preface.ljust(_USER_BLOCK, b"\0") if self._preface else b""
+                head = preface + file.id.get_file_image()
+            # A pipe of this name would wait for a reader.
+            path.unlink(missing_ok=True)
+            path.write_bytes(head)
+            # Space is reserved before anything is written, because HDF5 may crash the process on a full disk.
+            labels = sum(len(str(value)) for value in template.attrs.values())
+            _reserve(path, labels + sum(entry.values.nbytes + _LABELS for entry in entries))
+            with h5py.File(path, "r+", libver=LIBVER) as file:
+                places = _write(file, template)
+                checksums.reserve(file)
+            _reserve(path, path.stat().st_size)
+            with open(path, "r+b") as file:
                 mapped = mmap.mmap(file.fileno(), 0)
         data = {name: entry.values for name, entry in template.data.items()}
         return {n: np.ndarray(data[n].shape, data[n].dtype, mapped, at) for n, at in places.items()}
@@ -267,29 +281,6 @@ def write_result(result: Labelled, path: Path, temporary: Path, preface: bytes =
         for name, array in file.lay_out(result).items():
             array[...] = result.data[name].values
         file.finish(path)
-
-
-def _write_frame(template: Labelled, path: Path, preface: bytes) -> Mapping[str, int]:
-    """Write everything except the data, whose contiguous space stays blank; returns the positions of the data.
-
-    Space is reserved before anything is written, because HDF5 may crash the process on a full disk.
-    """
-    with h5py.File("head", "w", driver="core", backing_store=False, track_order=True, libver=LIBVER) as file:
-        file.flush()
-        head = (preface.ljust(_USER_BLOCK, b"\0") if preface else b"") + file.id.get_file_image()
-    # A pipe of this name would wait for a reader.
-    path.unlink(missing_ok=True)
-    path.write_bytes(head)
-    entries = [*template.coords.values(), *template.data.values()]
-    _reserve(
-        path,
-        sum(entry.values.nbytes + _LABELS for entry in entries) + sum(len(str(x)) for x in template.attrs.values()),
-    )
-    with h5py.File(path, "r+", libver=LIBVER) as file:
-        places = _write(file, template)
-        checksums.reserve(file)
-    _reserve(path, path.stat().st_size)
-    return places
 
 
 def _reserve(path: Path, size: int) -> None:
