@@ -74,18 +74,18 @@ def natural_frequencies(mu: Any, gamma: Any) -> np.ndarray:
     return np.sqrt(np.stack([mu / gamma / upper, upper], axis=-1))
 
 
-def resonance_speeds(values: Values, orders: int = 3) -> np.ndarray:
-    """Speeds of parametric resonance, eq. (15), up to order ``orders`` of each family, shape ``(..., 6 orders)``.
-
-    H: omega_i/(2k), S: omega_i/(2k-1), C+-: (omega2 +- omega1)/(2k), in the order of the labels of ``cardan_resonances``.
-    """
-    omega = natural_frequencies(values["mu"], values["gamma"])
-    one, two = omega[..., 0], omega[..., 1]
+def parametric_speeds(modes: Any, sums: Any, orders: int) -> np.ndarray:
+    """Speeds of parametric resonance up to order ``orders``: of the frequencies ``modes`` H: omega/(2k), then S:
+    omega/(2k - 1), and of their ``sums`` C: sum/(2k); shape ``(..., n)``, by frequency, then by order."""
     ks = range(1, orders + 1)
-    harmonic = [w / (2 * k) for w in (one, two) for k in ks]
-    subharmonic = [w / (2 * k - 1) for w in (one, two) for k in ks]
-    combination = [w / (2 * k) for w in (two + one, two - one) for k in ks]
-    return np.stack([*harmonic, *subharmonic, *combination], axis=-1)
+    single = [w / (2 * k - shift) for shift in (0, 1) for w in modes for k in ks]
+    return np.stack([*single, *(w / (2 * k) for w in sums for k in ks)], axis=-1)
+
+
+def resonance_speeds(values: Values, orders: int = 3) -> np.ndarray:
+    """Speeds of parametric resonance, eq. (15), shape ``(..., 6 orders)``, in the order of the labels of the predictions."""
+    one, two = np.moveaxis(natural_frequencies(values["mu"], values["gamma"]), -1, 0)
+    return parametric_speeds((one, two), (two + one, two - one), orders)
 
 
 # The forcing has only even harmonics of the speed: it meets natural frequencies at the harmonic speeds. Difference
@@ -168,11 +168,7 @@ def driveline_resonances(orders: int = 2) -> Resonances:
 
     def speeds(values: Values) -> np.ndarray:
         w = torsional_frequencies(values)
-        return np.array(
-            [w[i] / (2 * k) for i in modes for k in ks]
-            + [w[i] / (2 * k - 1) for i in modes for k in ks]
-            + [(w[i] + w[j]) / (2 * k) for i, j in pairs for k in ks]
-        )
+        return parametric_speeds(w, [w[i] + w[j] for i, j in pairs], orders)
 
     single = [f"{kind}{i + 1}{k}" for kind in "HS" for i in modes for k in ks]
     return Resonances(
