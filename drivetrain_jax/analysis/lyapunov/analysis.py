@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax._quantities import Dimension, Parameter, Variable, count
 from drivetrain_jax.analysis._base import MOST_SECONDS, MOST_STEPS, Analysis, Outcome, Request, Solver, in_time_of
 from drivetrain_jax.analysis.lyapunov.growth_record import (
     SEGMENTS,
@@ -251,14 +251,11 @@ def by_groups(
     return jax.lax.scan(group, empty(), limits)[0]
 
 
+_ERROR = "by twice the steps on an orbit, from block means otherwise"
+_KINDS = tuple(verdict.name.lower() for verdict in Verdict)
 VARIABLES = (
     Variable("lyapunov_spectrum", "1/s", "Lyapunov exponent", ("exponent",)),
-    Variable(
-        "lyapunov_standard_error",
-        "1/s",
-        "standard error of the exponent: by twice the steps on an orbit, from block means otherwise",
-        ("exponent",),
-    ),
+    Variable("lyapunov_standard_error", "1/s", f"standard error of the exponent: {_ERROR}", ("exponent",)),
     Variable("lyapunov_history", "1/s", "exponent averaged up to this time", ("segment", "exponent")),
     Variable("sum_rule_residual", "1/s", "sum of the exponents minus the mean divergence"),
     Variable("paper_estimator", "1/s", "published estimate of the exponents, not a Lyapunov exponent", ("component",)),
@@ -266,28 +263,15 @@ VARIABLES = (
         "chaos_k01", "1", "largest K of the 0-1 test: near 0 regular, near 1 chaotic; 0 if the motion is on an orbit"
     ),
     Variable("period_multiple", "1", "strobes after which the motion repeats (0: not found)", dtype="int32"),
-    Variable(
-        "verdict",
-        "1",
-        "kind of motion by its strobes (fixed_point repeats at every one)",
-        dtype="int8",
-        flags=tuple(v.name.lower() for v in Verdict),
-    ),
+    Variable("verdict", "1", "kind of motion by its strobes (fixed_point repeats at every one)", (), "int8", _KINDS),
 )
+_NEEDED = f"as many as the field needs, at least {LEAST}"
 OPTIONS = (
     Parameter(
         "standard_error", "1/s", "standard error at which a run without an orbit may end", default=0.0, lower=0.0
     ),
     Parameter("max_time", "s", "longest time of a run", default=1.0, lower=0.0, upper=MOST_SECONDS, open_lower=True),
-    Parameter(
-        "steps",
-        "1",
-        "integration steps per strobe",
-        derived=f"as many as the field needs, at least {LEAST}",
-        lower=4,
-        upper=1e6,
-        integer=True,
-    ),
+    count("steps", "integration steps per strobe", derived=_NEEDED, lower=4, upper=1e6),
 )
 _SECTION = {"verdict", "chaos_k01", "period_multiple"}
 # Number of members whose data of one step fit into the innermost caches.
@@ -309,7 +293,7 @@ class Spectrum(NamedTuple):
 
 def spectrum_of(record: Record) -> Spectrum:
     """Exponents after the transient. For an unbounded motion: means over the recorded time, errors NaN."""
-    values, errors, weighted = mean_growth(record, record.span)
+    values, errors, weighted = mean_growth(record)
     values = jnp.where(record.bounded, values, _until_the_end(record, record.growth))
     errors = jnp.where(record.bounded, errors, jnp.nan)
     order = jnp.argsort(-values, axis=0)

@@ -130,17 +130,9 @@ class Record(NamedTuple):
 
 class _March(NamedTuple):
     frame: Frame
-    strobe: Array
     alive: Array
-    bounded: Array
     segment: Array
-    growth: Array
-    contraction: Array
-    growth_moment: Array
-    contraction_moment: Array
-    size: Array
-    used: Array
-    orbit: Orbit
+    record: Record
 
 
 def state_size(flow: Flow, y: Vector) -> Array:
@@ -164,30 +156,26 @@ def record_growth(
     # Strobes in each of the equal parts of ``max_time``, at least one.
     strobes = jnp.ceil(jnp.asarray(max_time / flow.period / SEGMENTS)).astype(jnp.int64)
     length = jnp.broadcast_to(strobes, shape)
-    record, growth = jnp.zeros((SEGMENTS, *shape)), jnp.zeros((SEGMENTS, len(frame.tangents[0]), *shape))
-    active = jnp.broadcast_to(active, shape)
-    start = _March(
-        frame, jnp.zeros(shape, jnp.int64), active, jnp.ones(shape, bool), jnp.int64(0),
-        growth, record, growth, record, record, jnp.zeros(shape, jnp.int64), no_orbit(flow),
+    series, growth = jnp.zeros((SEGMENTS, *shape)), jnp.zeros((SEGMENTS, len(frame.tangents[0]), *shape))
+    active, none, span = jnp.broadcast_to(active, shape), jnp.zeros(shape, jnp.int64), length * flow.period
+    record = Record(
+        growth, series, growth, series, series, none, jnp.ones(shape, bool), (), none, no_orbit(flow), span
     )  # fmt: skip
     segment = one_kernel(flow)(_segment(flow, steps, needed_parts(flow, steps, active), length))
-    span = length * flow.period
 
     def body(march: _March) -> _March:
         march = segment(march, jnp.max(jnp.where(march.alive, length, 0)))
         return jax.lax.cond(jnp.any(jnp.asarray(_CHECKS) == march.segment), check, lambda m: m, march)
 
     def check(march: _March) -> _March:
-        reached, diverging = _reached(march, span, target)
-        march = march._replace(orbit=_orbit_of(flow, steps, march, span, reached, diverging))
-        on_orbit = march.orbit.found & (not to_the_end)
-        return march._replace(alive=march.alive & ~reached & ~on_orbit)
+        reached, diverging = _reached(march, target)
+        record = march.record._replace(orbit=_orbit_of(flow, steps, march, reached, diverging))
+        on_orbit = record.orbit.found & (not to_the_end)
+        return march._replace(alive=march.alive & ~reached & ~on_orbit, record=record)
 
+    start = _March(frame, active, jnp.int64(0), record)
     march = jax.lax.while_loop(lambda m: (m.segment < SEGMENTS) & jnp.any(m.alive), body, start)
-    return Record(
-        march.growth, march.contraction, march.growth_moment, march.contraction_moment, march.size, march.used,
-        march.bounded, march.frame.state, march.strobe, march.orbit, span,
-    )  # fmt: skip
+    return march.record._replace(state=march.frame.state)
 
 
 def _grown(flow: Flow, steps: Any, parts: Array) -> Callable[[Array, Frame], tuple[Frame, Array]]:
@@ -227,48 +215,48 @@ def _segment(flow: Flow, steps: Any, parts: Array, length: Array) -> Callable[[_
         return k + 1, frame, number + moving, alive & ~left, bounded & ~left, growth + logs, moments, size
 
     def segment(march: _March, longest: Array) -> _March:
-        nothing, no_growth = jnp.zeros_like(march.size[0]), jnp.zeros_like(march.growth[0])
+        old, at = march.record, march.segment
+        nothing, no_growth = jnp.zeros_like(old.size[0]), jnp.zeros_like(old.growth[0])
         frame = march.frame._replace(contraction=nothing)
-        carry = (
-            jnp.int64(0), frame, march.strobe, march.alive, march.bounded, no_growth, (no_growth, nothing), nothing,
-        )  # fmt: skip
+        carry = jnp.int64(0), frame, old.strobe, march.alive, old.bounded, no_growth, (no_growth, nothing), nothing
         end = jax.lax.while_loop(lambda c: c[0] < longest, strobe, carry)
         _, frame, number, alive, bounded, growth, moments, size = end
-        at = march.segment
-        return _March(
-            frame, number, alive, bounded, at + 1, march.growth.at[at].set(growth),
-            march.contraction.at[at].set(frame.contraction), march.growth_moment.at[at].set(moments[0]),
-            march.contraction_moment.at[at].set(moments[1]), march.size.at[at].set(size), march.used + alive, march.orbit,
+        new = old._replace(
+            growth=old.growth.at[at].set(growth), contraction=old.contraction.at[at].set(frame.contraction),
+            growth_moment=old.growth_moment.at[at].set(moments[0]), size=old.size.at[at].set(size), used=old.used + alive,
+            contraction_moment=old.contraction_moment.at[at].set(moments[1]), bounded=bounded, strobe=number,
         )  # fmt: skip
+        return _March(frame, alive, at + 1, new)
 
     return segment
 
 
-def _reached(march: _March, span: Array, target: float) -> tuple[Array, Array]:
+def _reached(march: _March, target: float) -> tuple[Array, Array]:
     """Flags where the standard error is small enough and the transient has decayed, and where vectors grow beyond their
     error."""
-    mean, error, _ = mean_growth(march, span)
+    record = march.record
+    mean, error, _ = mean_growth(record)
     largest = jnp.max(mean, axis=0)
-    settled = (largest > 0) | (largest * march.used * span < -SETTLED)
+    settled = (largest > 0) | (largest * record.used * record.span < -SETTLED)
     averaged = march.segment > _CHECKS[0]
     reached = averaged & settled & (jnp.max(error, axis=0) <= target)
     return reached, averaged & jnp.any(mean > STANDARD_ERRORS * error, axis=0)
 
 
-def _orbit_of(flow: Flow, steps: Any, march: _March, span: Array, reached: Array, diverging: Array) -> Orbit:
+def _orbit_of(flow: Flow, steps: Any, march: _March, reached: Array, diverging: Array) -> Orbit:
     """Orbits of the march, with those of members whose motion the steps resolve and that do not diverge from where it is.
 
     The volume of the vectors shows whether the steps resolve the motion. Multiples of the clocks' period are tried last.
     """
-    time = march.used * span
-    rates, shrinking = jnp.sum(march.growth, axis=0) / time, jnp.sum(march.contraction, axis=0) / time
+    record, state = march.record, march.frame.state
+    time = record.used * record.span
+    rates, shrinking = jnp.sum(record.growth, axis=0) / time, jnp.sum(record.contraction, axis=0) / time
     sound = adds_up(rates, jnp.zeros_like(rates), jnp.sum(rates, axis=0) - shrinking, flow.period)
-    resting = jnp.max(march.size, axis=0) == 0
-    wanted = march.alive & ~march.orbit.found & sound & (~diverging | resting)
+    resting = jnp.max(record.size, axis=0) == 0
+    wanted = march.alive & ~record.orbit.found & sound & (~diverging | resting)
     last = reached | (march.segment == SEGMENTS)
-    period = common_period(flow, march.frame.state)
-    orbit = find_orbit(flow, steps, march.frame.state, march.strobe, period, wanted, wanted & last)
-    return jax.tree.map(lambda new, old: jnp.where(orbit.found, new, old), orbit, march.orbit)
+    orbit = find_orbit(flow, steps, state, record.strobe, common_period(flow, state), wanted, wanted & last)
+    return jax.tree.map(lambda new, old: jnp.where(orbit.found, new, old), orbit, record.orbit)
 
 
 def block_size(used: Array) -> Array:
@@ -311,13 +299,13 @@ def weighted_mean(series: Array, moments: Array, used: Array, span: Array) -> tu
     return means[0], _SAFETY * jnp.maximum(*(abs(mean - means[0]) for mean in means[1:]))
 
 
-def mean_growth(record: Record | _March, span: Array) -> tuple[Array, Array, Array]:
+def mean_growth(record: Record) -> tuple[Array, Array, Array]:
     """Mean rates of the vectors and their errors, both ``(m, ...)``, and flags of weighted means, ``(...)``.
 
     Means are weighted where this makes the errors of all vectors much smaller and no rate is positive beyond its error.
     """
-    plain, errors = block_mean(record.growth, record.used, span)
-    weighted, sharp = weighted_mean(record.growth, record.growth_moment, record.used, span)
+    plain, errors = block_mean(record.growth, record.used, record.span)
+    weighted, sharp = weighted_mean(record.growth, record.growth_moment, record.used, record.span)
     regular = jnp.all((plain <= 3 * errors) & (sharp < _SHARPER * errors), axis=0)
     return jnp.where(regular, weighted, plain), jnp.where(regular, sharp, errors), regular
 
