@@ -297,6 +297,9 @@ FURTHER = {
     ),
     "condition and orbit_spectral_radius": (second_order, SHAFT, ("zeta", "gamma"), 1e-3, 1e-6),
     "measures of rattle": (measures, GEARS, ("omega", "B0", "c", "alpha"), 1e-3, 1e-7),
+    "samples of rattle": (
+        lambda g: dt.steady_state(g, outputs="u_history").u_history, GEARS, ("omega", "B1"), 1e-5, 1e-6
+    ),
 }  # fmt: skip
 
 

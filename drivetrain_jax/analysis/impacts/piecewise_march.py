@@ -450,7 +450,7 @@ class _Walk(NamedTuple):
 
 
 def timed_motion(
-    oscillator: PiecewiseLinearOscillator, u: Array, v: Array, turns: Array, span: float = np.inf, most_events: int = 0
+    oscillator: PiecewiseLinearOscillator, u: Array, v: Array, turns: Array, span: float = np.inf, most_events: int = 1
 ) -> tuple[Array, Array, Events, Array]:
     """Displacement and velocity after the rising ``turns`` (T, N) of the drive, the first ``most_events`` events, and flags
     ``(N,)``.
