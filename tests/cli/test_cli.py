@@ -399,7 +399,7 @@ def test_parts_that_cannot_be_read_are_wrong_input(cli, monkeypatch):
     os.mkdir("r.nc.parts")
     monkeypatch.setattr("drivetrain_jax.runs.output.os.access", lambda path, mode: Path(path).suffix != ".parts")
     code, _, err = cli("run", "scene.toml", "--out", "r.nc")
-    assert (code, len(err)) == (2, 1) and "'r.nc.parts' is no readable folder; expected" in err[0]
+    assert (code, len(err)) == (2, 1) and "'r.nc.parts' is no readable folder; move it away" in err[0]
 
 
 def test_parts_that_cannot_be_written_are_wrong_input(cli, monkeypatch):
