@@ -180,9 +180,9 @@ def losses(pairs: Sequence[Compared]) -> str:
     behind = [1 / ratio for ratio in ratios if 0 < ratio <= 1 / LEVEL]
     where = f"{len(behind)} of {len(ratios)} regions (error {GOAL:g}, one core)"
     return (
-        f"A rival is faster in {where}, up to {times(max(behind))} times."
+        f"Another library is faster in {where}, up to {times(max(behind))} times."
         if behind
-        else f"No rival is faster in any of {where}."
+        else f"No other library is faster in any of {where}."
     )
 
 
@@ -296,7 +296,7 @@ def _highlights(rows: pd.DataFrame, pairs: Sequence[Compared]) -> list[str]:
     lines = []
     for pair in (pair for pair in pairs if (pair.system, pair.region) == ("bicardan", "typical")):
         rate = count(1 / pair.package.seconds_per_point)
-        speed = against(pair.ratio, f"the best rival ({pair.rival.method})")
+        speed = against(pair.ratio, f"the best other method ({pair.rival.method})")
         lines.append(f"Stepped shaft: {rate} shafts/s on one core with six certified critical speeds each, {speed}.")
     rates = 1 / rows[rows.system == "atlas"].groupby("method").seconds_per_point.min()
     words = {"package, evaluation": "grid cells", "package, points": "scattered points"}
@@ -304,7 +304,7 @@ def _highlights(rows: pd.DataFrame, pairs: Sequence[Compared]) -> list[str]:
     charts = [f"{pair.region}: {against(pair.ratio, pair.rival.method)}" for pair in pairs if pair.system == "atlas"]
     if speeds:
         lines.append(f"Evaluation of an atlas, with bounds and verdicts: {'; '.join(speeds)}.")
-        lines.append(f"Atlas of the chart: {charts[0]}; {charts[-1]} (the start of the rival is not counted).")
+        lines.append(f"Atlas of the chart: {charts[0]}; {charts[-1]} (the start of heyoka is not counted).")
     return lines
 
 

@@ -83,7 +83,7 @@ def test_comparisons_with_the_best_rival(tmp_path):
     write(tmp_path, "precision_cardan", rows)
     pairs = page.compared(page.rungs(tmp_path))
     assert [p.ratio for p in pairs] == [pytest.approx(0.5), pytest.approx(3), math.inf, pytest.approx(1.05)]
-    assert "A rival is faster in 1 of 4 regions" in page.losses(pairs)
+    assert "Another library is faster in 1 of 4 regions" in page.losses(pairs)
     assert page.answer(pairs).endswith(
         "| 2 | 1 | 1 | 0.5 (easy, method) | no rival reaches the error (near boundary) |"
     )
