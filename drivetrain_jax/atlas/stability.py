@@ -22,7 +22,7 @@ from jax import Array
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.analysis.floquet import quartic
 from drivetrain_jax.analysis.floquet.direct import Monodromy, assemble
-from drivetrain_jax.analysis.floquet.multipliers import characteristic_polynomial
+from drivetrain_jax.analysis.floquet.multipliers import PolynomialError, characteristic_polynomial
 from drivetrain_jax.analysis.floquet.results import VARIABLES, results
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
@@ -285,5 +285,7 @@ def _by_eigenvalues(
         relative = jnp.maximum(relative, jnp.abs(residual))
     halves = form.halves
     rounding = 4 * np.finfo(float).eps * jnp.sum(matrix**2, axis=(0, 1)) ** (halves / 2) / rho
-    monodromy = Monodromy(z, jnp.zeros_like(rho), relative + rounding, relative <= 10 * rtol, residual)
+    sizes = jnp.stack([(relative + rounding) * rho**k for k in range(1, n + 1)])
+    error_of_z = PolynomialError(sizes, jnp.zeros_like(rho))
+    monodromy = Monodromy(z, jnp.zeros_like(rho), error_of_z, relative <= 10 * rtol, residual)
     return results(monodromy, outputs, rtol, model, spectrum=spectrum)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from drivetrain_jax.analysis.floquet.multipliers import (
+    PolynomialError,
     characteristic_coefficients,
     multiplier_errors,
     root_scale,
@@ -77,12 +78,18 @@ def difference(a: np.ndarray, b: np.ndarray, rho: np.ndarray) -> np.ndarray:
     return ((np.abs(a[:, 1:] - b[:, 1:]) / rho[:, None] ** k).max(axis=1) + noise).astype(float)
 
 
+def relative(error: np.ndarray, roots: np.ndarray) -> PolynomialError:
+    """Errors of the coefficients a_k of ``error`` times the k-th power of the largest root, ``(N,)`` and ``(N, n)``."""
+    powers = np.arange(1, roots.shape[1] + 1)[:, None]
+    return PolynomialError(jnp.asarray(error * np.abs(roots).max(axis=1) ** powers))
+
+
 @pytest.fixture(scope="module")
 def bound():
     compiled = jax.jit(spectral_radius_bound)
 
     def evaluate(roots, error):
-        return np.asarray(compiled(jnp.asarray(roots.real.T), jnp.asarray(roots.imag.T), jnp.asarray(error)))
+        return np.asarray(compiled(jnp.asarray(roots.real.T), jnp.asarray(roots.imag.T), relative(error, roots)))
 
     return evaluate
 
@@ -128,7 +135,7 @@ def test_every_multiplier_lies_within_its_error(pairs):
     exact, changed = exact_coefficients(roots), exact_coefficients(other)
     for computed, distance in ((roots, apart.min(axis=2)), (other, apart.min(axis=1))):
         error = difference(exact, changed, np.abs(computed).max(axis=1))
-        limit = np.asarray(jax.jit(multiplier_errors)(computed.real.T, computed.imag.T, error)).T
+        limit = np.asarray(jax.jit(multiplier_errors)(computed.real.T, computed.imag.T, relative(error, computed))).T
         assert (distance <= limit).all(), (distance / limit).max()
 
 
@@ -177,7 +184,7 @@ def test_bound_is_infinite_if_nothing_is_certain(bound, error):
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
 def test_bound_of_other_sizes(n):
     roots = np.linspace(1, -0.5, n)
-    limit = float(spectral_radius_bound(jnp.asarray(roots), jnp.zeros(n), jnp.asarray(1e-10)))
+    limit = float(spectral_radius_bound(jnp.asarray(roots), jnp.zeros(n), PolynomialError(jnp.full(n, 1e-10))))
     assert 1e-10 < limit < 1e-6
 
 

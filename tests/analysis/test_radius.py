@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from drivetrain_jax.analysis.floquet.multipliers import PolynomialError
 from drivetrain_jax.analysis.floquet.results import has_closed_form, radius_by_eigenvalues, radius_in_closed_form
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
 from tests.quick_jit import quick_jit
@@ -40,6 +41,12 @@ def samples(count: int) -> np.ndarray:
     return found
 
 
+def relative(z: jnp.ndarray) -> PolynomialError:
+    """Coefficients with the relative error ``ERROR``."""
+    rho = np.abs(np.linalg.eigvals(np.nan_to_num(np.moveaxis(np.asarray(z), -1, 0)))).max(axis=1)
+    return PolynomialError(jnp.asarray(ERROR * rho ** np.arange(1, 5)[:, None]))
+
+
 LANES = 3000
 closed_form = quick_jit(radius_in_closed_form)
 
@@ -48,7 +55,7 @@ def radii(z: jnp.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Radius and bound of each lane; all calls share a kernel of ``LANES`` lanes."""
     lanes = z.shape[-1]
     z = jnp.pad(z, ((0, 0), (0, 0), (0, LANES - lanes)), mode="edge")
-    rho, bound, _ = closed_form(z, jnp.full(LANES, ERROR), jnp.ones(LANES), jnp.zeros(LANES, bool), TOLERANCE)
+    rho, bound, _ = closed_form(z, relative(z), jnp.ones(LANES), jnp.zeros(LANES, bool), TOLERANCE)
     return np.asarray(rho)[:lanes], np.asarray(bound)[:lanes]
 
 
@@ -58,7 +65,7 @@ def test_bound_holds_and_is_a_few_times_that_of_eigenvalues():
     exact = np.abs(multipliers).max(axis=1)
     rho, bound = radii(z)
     assert (np.abs(rho - exact) <= bound).all()
-    other = quick_jit(lambda z: radius_by_eigenvalues(eigenvalues(z), jnp.full(LANES, ERROR))[1])(z)
+    other = quick_jit(lambda z, error: radius_by_eigenvalues(eigenvalues(z), error)[1])(z, relative(z))
     assert np.median(bound / other) < 4
     assert (bound < TOLERANCE * exact).mean() > 0.99
 

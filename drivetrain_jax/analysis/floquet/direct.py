@@ -2,9 +2,9 @@
 
 With a scheme of order p, r times as many steps reduce the error by ``r^p``: the error of the finer propagator is the
 difference over ``r^p - 1``. The bound is four times that error, measured on the matrix and on the coefficients of its
-characteristic polynomial; the larger one counts, because either may vanish by accident. The determinant is compared with
-Liouville's exact value; schemes that keep the determinant without damping need another check of a missed oscillation
-(``Propagator.undamped``). All functions broadcast over a trailing batch, and may be part of a kernel.
+characteristic polynomial about the mean multiplier; both count, because either may vanish by accident. The determinant is
+compared with Liouville's exact value; schemes that keep the determinant without damping need another check of a missed
+oscillation (``Propagator.undamped``). All functions broadcast over a trailing batch, and may be part of a kernel.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis.floquet.multipliers import (
+    PolynomialError,
     characteristic_coefficients,
     characteristic_polynomial,
     root_scale,
@@ -34,8 +35,9 @@ class Propagator(NamedTuple):
 
     ``growth`` is the size at the end T of errors that were made on the way, each as large as the propagator at its time: the
     root mean square of ``|Phi(T, t)| |Phi(t, 0)|``, in units of ``exp(log_scale)``. It may exceed ``|Phi(T, 0)|`` by many
-    powers of ten. ``stiffness`` is the largest rate times the span, ``decay`` is ``-log det Phi``, and ``squared`` its ratio
-    to the decay that counts as strong, 0 for first-order equations.
+    powers of ten. ``terms`` ``(n, n, ...)`` are the sizes of the terms whose sum is ``matrix``. ``stiffness`` is the largest
+    rate times the span, ``decay`` is ``-log det Phi``, and ``squared`` its ratio to the decay that counts as strong, 0 for
+    first-order equations.
     ``undamped`` is the logarithm of the size that the fastest decaying mode may keep, because the scheme damps it too
     little, and infinite where an oscillation is too fast for the steps.
     """
@@ -43,6 +45,7 @@ class Propagator(NamedTuple):
     matrix: Array
     log_scale: Array
     growth: Any = 0.0
+    terms: Any = 0.0
     stiffness: Any = 0.0
     decay: Any = 0.0
     squared: Any = 0.0
@@ -51,14 +54,15 @@ class Propagator(NamedTuple):
     def in_units_of(self, log_scale: Array) -> Propagator:
         """The same with another ``log_scale``."""
         factor = jnp.exp(self.log_scale - log_scale)
-        return self._replace(matrix=factor * self.matrix, log_scale=log_scale, growth=factor * self.growth)
+        matrix, growth, terms = (factor * x for x in (self.matrix, self.growth, self.terms))
+        return self._replace(matrix=matrix, log_scale=log_scale, growth=growth, terms=terms)
 
 
 class Monodromy(NamedTuple):
     """``Z = exp(log_scale) matrix`` (up to similarity), ``(n, n, ...)``.
 
-    The coefficients a_k of ``matrix``'s characteristic polynomial are wrong by at most ``error`` times the k-th power of
-    its spectral radius. ``met`` is true if this error is within the target or the limit of rounding. ``residual`` is det Z
+    ``error`` is that of the characteristic polynomial of ``matrix``. ``met`` is true if the error of the matrix, relative to
+    its spectral radius, is within the target or the limit of rounding. ``residual`` is det Z
     minus its exact value (Liouville) in units of the n-th power of a lower bound of the spectral radius; 0 if the exact
     value is not known. ``change`` is the error of ``matrix`` entry by entry, with a safety factor of four: the distance of
     the finer result from the limit extrapolated from both results, or None without a second result.
@@ -66,7 +70,7 @@ class Monodromy(NamedTuple):
 
     matrix: Array
     log_scale: Array
-    error: Array
+    error: PolynomialError
     met: Array
     residual: Array
     change: Array | None = None
@@ -75,7 +79,7 @@ class Monodromy(NamedTuple):
 def unknown(n: int) -> Monodromy:
     """The matrix of one point before any solution."""
     zero, none = jnp.zeros(()), jnp.zeros((n, n))
-    return Monodromy(none, zero, jnp.array(jnp.inf), jnp.array(False), zero, none)
+    return Monodromy(none, zero, PolynomialError(jnp.full(n, jnp.inf), zero), jnp.array(False), zero, none)
 
 
 def assemble(ends: Array | None, phi: Array) -> Array:
@@ -130,36 +134,52 @@ def compare(
     """
     halves, n = (1 if ends is None else 2), len(fine.matrix)
     z_fine, z_coarse = (stored(partial(assemble, ends))(phi) for phi in (fine.matrix, coarse.matrix))
-    size = stored(partial(assemble, None if ends is None else jnp.abs(ends)))(jnp.abs(fine.matrix))
-    scales = stored(_balance)(size)
+    sizes = stored(partial(assemble, None if ends is None else jnp.abs(ends)))
+    size = sizes(jnp.abs(fine.matrix))
+    # Entries that vanish are as wrong as their terms.
+    scales = stored(_balance)(sizes(jnp.maximum(jnp.abs(fine.matrix), fine.terms)))
     plain = z_fine, z_fine - z_coarse
     z_fine, z_coarse, size = (stored(_scaled)(matrix, scales) for matrix in (z_fine, z_coarse, size))
     norm = jnp.sqrt(square_sum(size))
-    a_fine, slopes = stored(characteristic_polynomial)(z_fine)
-    a_coarse = stored(characteristic_coefficients)(z_coarse)
-    scale = stored(root_scale)(a_fine)
+    centre = sum(z_fine[i, i] for i in range(n)) / n
+    shift = centre * np.eye(n).reshape(n, n, *(1,) * centre.ndim)
+    a_fine, slopes = stored(characteristic_polynomial)(z_fine - shift)
+    a_coarse = stored(characteristic_coefficients)(z_coarse - shift)
+    # The mean of the multipliers is at most as large as the largest, and no farther from it than the sum of both.
+    scale = jnp.maximum(jnp.abs(centre), root_scale(a_fine) - jnp.abs(centre))
     log_scale = halves * fine.log_scale
     apart = z_fine - z_coarse
-    differences = [jnp.sqrt(square_sum(apart)) / scale]
-    differences += [jnp.abs(a_fine[k] - a_coarse[k]) / scale ** (k + 1) for k in range(n)]
     square = square_sum(fine.matrix)
-    differences.append(jnp.sqrt(square_sum(fine.matrix - coarse.matrix) / square))
-    difference = 4 * reduce(jnp.maximum, differences)
-    truncation = difference / (gain - 1)
+    relative = jnp.maximum(
+        jnp.sqrt(square_sum(apart)) / scale, jnp.sqrt(square_sum(fine.matrix - coarse.matrix) / square)
+    )
+    changes = [jnp.abs(a_fine[k] - a_coarse[k]) / scale ** (k + 1) for k in range(n)]
+    difference = 4 * reduce(jnp.maximum, changes, relative)
     residual = jnp.zeros_like(scale)
     if log_determinant is not None:
-        exact = jnp.exp(log_determinant - n * log_scale)
-        residual = ((-1) ** n * a_fine[-1] - exact) / scale**n
-    left = jnp.exp(halves * (fine.undamped - fine.log_scale)) / scale
-    truncation = reduce(jnp.maximum, (truncation, jnp.abs(residual), left))
+        determinant = (-1) ** n * reduce(lambda total, a: a - total * centre, a_fine, 1.0)
+        residual = (determinant - jnp.exp(log_determinant - n * log_scale)) / scale**n
+    lost = jnp.maximum(jnp.abs(residual), jnp.exp(halves * (fine.undamped - fine.log_scale)) / scale)
+    truncation = jnp.maximum(difference / (gain - 1), lost)
     unit = np.finfo(float).eps * norm / scale
-    # An error of Z as large as a rounding of its terms changes the coefficients by their slopes.
-    slope = reduce(jnp.maximum, (slopes[k] / scale**k for k in range(1, n)), 1.0)
-    grown = slope * jnp.sqrt(jnp.maximum(fine.growth**2 / square, 1.0)) * unit
-    of_products = (1 + jnp.sqrt(steps) / 2) * grown + jnp.minimum(steps / 2 * grown, difference)
+    grown = jnp.sqrt(jnp.maximum(fine.growth**2 / square, 1.0)) * unit
     of_entries = _ENTRIES * fine.stiffness * (halves * np.finfo(float).eps + jnp.minimum(fine.squared, 1.0) * unit)
-    rounding = of_products + of_entries
-    met = truncation <= jnp.maximum(rtol, rounding)
+
+    def rounding(slope: Array) -> Array:
+        """An error of Z as large as a rounding of its terms changes a coefficient by its slope."""
+        of_products = (1 + jnp.sqrt(steps) / 2) * slope * grown
+        return of_products + jnp.minimum(steps / 2 * slope * grown, difference)
+
+    of_matrix = jnp.maximum(4 / (gain - 1) * relative, lost) + of_entries
+    errors = []
+    for k in range(n):
+        slope = slopes[k] / scale**k
+        error = jnp.maximum(4 / (gain - 1) * changes[k], jnp.minimum(slope, 1.0) * of_matrix) + rounding(slope)
+        # The last term counts products of errors where the slopes vanish.
+        errors.append(scale ** (k + 1) * (error + (of_matrix + rounding(1.0)) ** (k + 1)))
+    largest_slope = reduce(jnp.maximum, (slopes[k] / scale**k for k in range(1, n)), 1.0)
+    met = truncation <= jnp.maximum(rtol, rounding(largest_slope) + of_entries)
     # The propagator itself keeps the units of its states.
     matrix, change = plain if ends is None else (z_fine, apart)
-    return Monodromy(matrix, log_scale, truncation + rounding, met, residual, (4 / (gain - 1)) * change)
+    error = PolynomialError(jnp.stack(errors), centre)
+    return Monodromy(matrix, log_scale, error, met, residual, (4 / (gain - 1)) * change)

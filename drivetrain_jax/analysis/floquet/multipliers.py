@@ -1,17 +1,12 @@
 """From a monodromy matrix to Floquet multipliers, a certified spectral radius and a verdict.
 
-The bound rests on the characteristic polynomial p(z) = det(z I - Z). Let its coefficients be wrong by at most
-``delta_k``, so that the true polynomial differs from the computed one by at most eps(z) = sum_k delta_k |z|^(n-k).
-By Rouche's theorem a circle on which |p| > eps encloses as many true as computed multipliers. Two families of circles
-bracket the spectral radius rho of the true matrix:
-
-- about the origin with radius rho + r: with s_i the multiplier nearest to z and d_i = rho + r - |s_i| <= |z - s_i|,
-  |p(z)| >= min_i d_i prod_(j != i) max(d_j, |s_i - s_j|/2), where |s_i - s_j| - d_i may replace half the gap if d_i is
-  below 1/32 of the smallest one (the product then grows with |z - s_i|). No true multiplier lies further out;
-- about the dominant multiplier s_1 with radius r, where |p(z)| >= r prod_(j != 1) ||s_1 - s_j| - r|: a true multiplier
-  lies inside.
-
-Near a double multiplier (the edge of every tongue) the bound is of the size of the square root of the coefficients' error.
+The bound rests on the characteristic polynomial p(z) = det(z I - Z). Let its coefficients be wrong by so little that the
+true polynomial differs from the computed one by at most eps(z) = sum_k delta_k |z - c|^(n-k), where the centre c is the
+mean of the multipliers: a cluster of them loses little then, although its coefficients about 0 are ill-conditioned. On a
+circle of radius r about a multiplier s_i, |p(z)| >= prod_j ||s_i - s_j| - r|. If this exceeds the largest eps(z), no root
+crosses the circle while the computed polynomial is deformed into the true one (Rouche). So each multiplier is within the
+smallest such radius r_i of its true value, and rho lies between |s_1| - r_1, for the largest multiplier, and
+max_i |s_i| + r_i. Near a double multiplier (the edge of every tongue) r_i is of the size of the square root of delta.
 
 Without damping a multiplier s has the partner 1/conj(s). If the circle about s holds no other multiplier, and its
 reflection at the unit circle meets no other circle, s is its own partner: it lies on the unit circle and is simple.
@@ -22,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import reduce
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -95,62 +90,54 @@ def over_first(operation: Callable[[Array, Array], Array], x: Array) -> Array:
     return reduce(operation, (x[i] for i in range(len(x))))
 
 
-def spectral_radius_bound(real: Array, imaginary: Array, error: Array) -> Array:
+class PolynomialError(NamedTuple):
+    """det(s I - Z) is wrong by at most ``sum_k sizes[k-1] |s - centre|^(n-k)``; ``sizes`` is ``(n, ...)``."""
+
+    sizes: Array
+    centre: Array | float = 0.0
+
+    def at(self, distance: Array) -> Array:
+        """The bound at a ``distance`` from the centre, which has the axes of the lanes last."""
+        return reduce(lambda total, size: total * distance + size, self.sizes, jnp.zeros_like(distance))
+
+    def lanes(self, chosen: Array) -> PolynomialError:
+        """The errors of some lanes."""
+        return PolynomialError(self.sizes[..., chosen], jnp.broadcast_to(self.centre, self.sizes.shape[1:])[chosen])
+
+
+def spectral_radius_bound(real: Array, imaginary: Array, error: PolynomialError) -> Array:
     """Bound of the error of ``rho``, the largest modulus of the multipliers ``real + i imaginary``, ``(n, ...) -> (...)``.
 
-    ``error`` bounds the errors of the coefficients a_k in units of rho^k. The result is at least four roundings of rho,
-    and inf if no circle of the ladder is certified.
+    It is at least four roundings of rho, and inf if no circle of the ladder is certified.
     """
-    n, rho = len(real), over_first(jnp.maximum, jnp.hypot(real, imaginary))
-    x, y = real / rho, imaginary / rho
-    modulus, diagonal = jnp.hypot(x, y), _diagonal(n, rho.ndim)
-    gap = jnp.hypot(x[:, None] - x, y[:, None] - y)
-    closest = over_first(jnp.minimum, jnp.where(diagonal, jnp.inf, gap))
-    x1, y1, top = x[0], y[0], modulus[0]
-    for j in range(1, n):
-        larger = modulus[j] > top
-        x1, y1, top = (jnp.where(larger, new, old) for new, old in ((x[j], x1), (y[j], y1), (modulus[j], top)))
-
-    def certified(r: Array, eps: Array) -> Array:
-        """For ``|z| <= 1 + r``, and for the circle about the largest multiplier; the unit is rho."""
-        reach = 1 + r - modulus
-        margin = jnp.where((reach < closest / 32)[:, None], gap - reach[:, None], gap / 2)
-        factors = jnp.where(diagonal, reach, jnp.maximum(reach, margin))
-        least = over_first(jnp.minimum, over_first(jnp.multiply, jnp.swapaxes(factors, 0, 1)))
-        return jnp.stack([least, over_first(jnp.multiply, jnp.abs(jnp.hypot(x - x1, y - y1) - r))]) > eps
-
-    radii = _smallest_radii(certified, jnp.stack([rho, rho]), n, error)
-    return rho * (over_first(jnp.maximum, radii) + 4 * np.finfo(float).eps)
+    modulus, radii = jnp.hypot(real, imaginary), multiplier_errors(real, imaginary, error)
+    rho = over_first(jnp.maximum, modulus)
+    inwards = over_first(jnp.minimum, jnp.where(modulus == rho, radii, jnp.inf))
+    return jnp.maximum(over_first(jnp.maximum, radii - (rho - modulus)), inwards)
 
 
 def _diagonal(n: int, axes: int) -> Array:
     return jnp.eye(n, dtype=bool).reshape(n, n, *(1,) * axes)
 
 
-def _smallest_radii(certified: Callable[[Array, Array], Array], like: Array, n: int, error: Array) -> Array:
-    """The smallest r of the ladder for which each of the conditions ``certified(r, eps)`` holds, or inf."""
-
-    def descend(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        r, radii = state
-        # All circles lie within |z| <= 1 + r, where sum_k error |z|^(n-k) <= n error (1 + r)^(n-1).
-        return r * _STEP, jnp.where(certified(r, n * error * (1 + r) ** (n - 1)), r, radii)
-
-    return jax.lax.fori_loop(0, _COUNT, descend, (jnp.asarray(_LARGEST), jnp.full_like(like, jnp.inf)))[1]
-
-
-def multiplier_errors(real: Array, imaginary: Array, error: Array, counted: Array | bool = True) -> Array:
+def multiplier_errors(real: Array, imaginary: Array, error: PolynomialError, counted: Array | bool = True) -> Array:
     """Bound of the error of each multiplier ``real + i imaginary``, ``(n, ...) -> (n, ...)``; inf if nothing is known.
 
-    ``error`` as in :func:`spectral_radius_bound`. Multipliers that are not ``counted`` ``(n, ...)`` are exactly 0.
+    Multipliers that are not ``counted`` ``(n, ...)`` are exactly 0.
     """
     rho = over_first(jnp.maximum, jnp.hypot(real, imaginary))
     distances = jnp.hypot(real[:, None] - real, imaginary[:, None] - imaginary) / rho
+    reach = jnp.hypot(real - error.centre, imaginary) / rho
+    scaled = PolynomialError(jnp.stack([size / rho**k for k, size in enumerate(error.sizes, 1)]))
 
-    def certified(r: Array, eps: Array) -> Array:
+    def descend(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        r, radii = state
         # The distance of a multiplier from itself is 0, so each product has the factor r.
-        return over_first(jnp.multiply, jnp.where(counted, jnp.abs(distances - r), 1.0)) > eps
+        product = over_first(jnp.multiply, jnp.where(counted, jnp.abs(distances - r), 1.0))
+        return r * _STEP, jnp.where(product > scaled.at(reach + r), r, radii)
 
-    return rho * (_smallest_radii(certified, real, len(real), error) + 4 * np.finfo(float).eps)
+    start = jnp.asarray(_LARGEST), jnp.full_like(real, jnp.inf)
+    return rho * (jax.lax.fori_loop(0, _COUNT, descend, start)[1] + 4 * np.finfo(float).eps)
 
 
 def graded_multipliers(factored: Factored) -> tuple[Array, Array, Array]:
@@ -192,18 +179,15 @@ def graded_multipliers(factored: Factored) -> tuple[Array, Array, Array]:
     powers = jnp.arange(1, n + 1).reshape(n, *(1,) * rho.ndim)
     error = over_first(jnp.maximum, changes / rho**powers + n * relative * (norm / rho) ** powers)
     counted = (powers <= over_first(jnp.add, member))[:, None]
-    errors = multiplier_errors(sigma.real, sigma.imag, error, counted)
+    errors = multiplier_errors(sigma.real, sigma.imag, PolynomialError(error * rho**powers), counted)
     first = sum((group[j] < group).astype(int) for j in range(n))
     chosen = (place - first)[None]
     sigma, errors = (jnp.take_along_axis(x, chosen, axis=0)[0] for x in (sigma, errors))
     return scale, sigma, errors
 
 
-def all_on_the_circle(real: Array, imaginary: Array, error: Array, scale: Array) -> Array:
-    """True if all multipliers ``scale (real + i imaginary)`` without damping are simple and on the unit circle, ``(...)``.
-
-    ``error`` as in :func:`spectral_radius_bound`.
-    """
+def all_on_the_circle(real: Array, imaginary: Array, error: PolynomialError, scale: Array) -> Array:
+    """True if all multipliers ``scale (real + i imaginary)`` without damping are simple and on the unit circle."""
     radius = multiplier_errors(real, imaginary, error)
     gaps = jnp.hypot(real[:, None] - real, imaginary[:, None] - imaginary)
     # Four radii about a multiplier at the unit circle contain the reflection of its circle if that is below 0.1.

@@ -440,20 +440,21 @@ class _State(NamedTuple):
 
     ``covariance`` is that of errors at t which were made at the ends of all panels: independent, and in each row as large as
     the terms of its products. With the propagator P of a panel it obeys ``C' = P C P^T + D``, where D is the diagonal of
-    ``(|P| |matrix|) (|P| |matrix|)^T``. ``stiffness`` is the integral of the largest rate max |a_ij a_ji|^(1/2), which no
-    scaling of states changes, and ``decay`` that of ``-tr A``.
+    ``terms terms^T``, with the ``terms = |P| |matrix|`` of the last product. ``stiffness`` is the integral of the largest
+    rate max |a_ij a_ji|^(1/2), which no scaling of states changes, and ``decay`` that of ``-tr A``.
     """
 
     matrix: Array
     log_scale: Array
     covariance: Array
+    terms: Array
     stiffness: Array
     decay: Array
 
     @classmethod
     def start(cls, n: int, lanes: int) -> _State:
         unit = jnp.broadcast_to(jnp.eye(n)[..., None], (n, n, lanes))
-        return cls(unit, jnp.zeros(lanes), jnp.zeros_like(unit), jnp.zeros(lanes), jnp.zeros(lanes))
+        return cls(unit, jnp.zeros(lanes), jnp.zeros_like(unit), unit, jnp.zeros(lanes), jnp.zeros(lanes))
 
     def scaled_rows(self, d: int, factor: Any) -> _State:
         """The states from number ``d`` on in another unit."""
@@ -462,7 +463,8 @@ class _State(NamedTuple):
             return self
         rows = jnp.where((np.arange(n) < d)[:, None], 1.0, factor)
         covariance = self.covariance * rows[:, None] * rows
-        return self._replace(matrix=self.matrix * rows[:, None], covariance=covariance)
+        matrix, terms = self.matrix * rows[:, None], self.terms * rows[:, None]
+        return self._replace(matrix=matrix, covariance=covariance, terms=terms)
 
     def propagator(self, panels: Any) -> Propagator:
         n = len(self.matrix)
@@ -471,6 +473,7 @@ class _State(NamedTuple):
             self.matrix,
             self.log_scale,
             jnp.sqrt(variance),
+            self.terms,
             self.stiffness,
             self.decay,
             0 * self.decay,
@@ -553,15 +556,15 @@ class Panels:
             terms = stored(matmul)(jnp.abs(moved), jnp.abs(state.matrix))
             covariance = stored(_covariance)(carried, moved, factor, terms)
             stiffness, decay = stored(self._rates)(coefficients)
-            return covariance, state.stiffness + stiffness, state.decay + decay
+            return covariance, stored(jnp.multiply)(terms, factor), state.stiffness + stiffness, state.decay + decay
 
-        records_now = state.covariance, state.stiffness, state.decay
-        covariance, stiffness, decay = jax.lax.cond(records, recorded, lambda: records_now)
+        records_now = state[2:]
+        records_now = jax.lax.cond(records, recorded, lambda: records_now)
         # Logarithms cost as much as half a panel.
         log_scale = jax.lax.cond(
             any_lane(factor != 1), lambda: state.log_scale - jnp.log(factor), lambda: state.log_scale
         )
-        return _State(matrix, log_scale, covariance, stiffness, decay)
+        return _State(matrix, log_scale, *records_now)
 
     def _rates(self, coefficients: tuple[Array, ...]) -> tuple[Array, Array]:
         """The largest rate and ``-tr A``, integrated over the panel."""

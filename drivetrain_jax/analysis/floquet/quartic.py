@@ -190,6 +190,15 @@ def factors(c: Coefficients) -> tuple[_Factor, _Factor]:
     return one, two
 
 
+def farthest(split: tuple[_Factor, _Factor], centre: Array) -> Array:
+    """The largest distance of the four roots from ``centre``."""
+    squares = []
+    for factor in split:
+        away = jnp.abs(factor.half - centre)
+        squares.append(jnp.where(factor.real, (away + factor.gap) ** 2, away**2 + factor.gap**2))
+    return jnp.sqrt(jnp.maximum(*squares))
+
+
 def _monic(e1: Array, e2: Array, e3: Array, kappa: Array) -> tuple[Array, Array, Array]:
     inverse = 1 / kappa
     return e1 * inverse, e2 * inverse**2, e3 * inverse**3

@@ -21,6 +21,7 @@ from drivetrain_jax.analysis.floquet import quartic
 from drivetrain_jax.analysis.floquet.direct import Monodromy
 from drivetrain_jax.analysis.floquet.multipliers import (
     VERDICTS,
+    PolynomialError,
     all_on_the_circle,
     characteristic_coefficients,
     graded_multipliers,
@@ -53,18 +54,19 @@ def has_closed_form(z: Array) -> bool:
     return len(z) == 4 and z.ndim == 3
 
 
-def radius_by_eigenvalues(spectrum: Spectrum, error: Array) -> Radius:
-    """Spectral radius and bound; ``error`` bounds the errors of the coefficients a_k in units of rho^k."""
+def radius_by_eigenvalues(spectrum: Spectrum, error: PolynomialError) -> Radius:
+    """Spectral radius and bound."""
 
-    def radius(values: tuple[Array, ...], _: int) -> Radius:
-        return over_first(jnp.maximum, jnp.hypot(*values[:2])), spectral_radius_bound(*values)
+    def radius(values: tuple[Spectrum, PolynomialError], _: int) -> Radius:
+        spectrum, error = values
+        return over_first(jnp.maximum, jnp.hypot(*spectrum)), spectral_radius_bound(*spectrum, error)
 
-    values = *spectrum, error
-    return in_blocks(radius, values, len(error), _BLOCK, in_one_kernel) if error.ndim == 1 else radius(values, 1)
+    values, lanes = (spectrum, error), error.sizes.shape[-1]
+    return in_blocks(radius, values, lanes, _BLOCK, in_one_kernel) if error.sizes.ndim == 2 else radius(values, 1)
 
 
 def radius_in_closed_form(
-    z: Array, error: Array, scale: Array, undamped: Array, tolerance: float
+    z: Array, error: PolynomialError, scale: Array, undamped: Array, tolerance: float
 ) -> tuple[Array, Array, Array]:
     """Spectral radius and bound of ``z`` ``(4, 4, N)``, and flags of bounded motion without damping.
 
@@ -73,11 +75,11 @@ def radius_in_closed_form(
     """
     lanes = z.shape[-1]
 
-    def closed(block: tuple[Array, Array, Array, Array], _: int) -> tuple[Array, Array, Array]:
+    def closed(block: tuple[Array, PolynomialError, Array, Array], _: int) -> tuple[Array, Array, Array]:
         z, error, scale, undamped = block
         c, norm = _coefficients(z)
         split = quartic.factors(c)
-        errors = stored(_errors)(error, jnp.maximum(split[0].large, split[1].large), norm, c.errors[0])
+        errors = stored(_errors)(error, stored(quartic.farthest)(split, error.centre), norm, c.errors[0])
         rho, bound, unsure = stored(quartic.spectral_radius)(c._replace(errors=errors), split)
         clear = ~unsure & (bound <= tolerance * rho) & (jnp.abs(scale * rho - 1) > scale * bound)
         return rho, bound, clear & ~undamped
@@ -87,8 +89,9 @@ def radius_in_closed_form(
         certain = state[-1]
         chosen = jnp.nonzero(~certain, size=min(lanes, _REPAIRED), fill_value=jnp.argmin(certain))[0]
         spectrum = eigenvalues(z[..., chosen])
-        on_circle = all_on_the_circle(*spectrum, error[chosen], scale[chosen])
-        replaced = *radius_by_eigenvalues(spectrum, error[chosen]), undamped[chosen] & on_circle, True
+        own = error.lanes(chosen)
+        on_circle = all_on_the_circle(*spectrum, own, scale[chosen])
+        replaced = *radius_by_eigenvalues(spectrum, own), undamped[chosen] & on_circle, True
         return tuple(x.at[chosen].set(new) for x, new in zip(state, replaced, strict=True))
 
     rho, bound, certain = in_blocks(closed, (z, error, scale, undamped), lanes, _BLOCK, in_one_kernel)
@@ -108,10 +111,10 @@ def _coefficients(z: Array) -> tuple[quartic.Coefficients, Array]:
     return quartic.Coefficients(-a[0], a[1], -a[2], kappa, (d - a[3],)), norm  # pyright: ignore[reportArgumentType]
 
 
-def _errors(error: Array, size: Array, norm: Array, moved: Array) -> tuple[Array, ...]:
+def _errors(error: PolynomialError, farthest: Array, norm: Array, moved: Array) -> tuple[Array, ...]:
     # The recursion for a_k multiplies k matrices.
-    errors = [error * size**k + _ROUNDINGS * quartic.EPS * norm**k for k in (1, 2, 3, 4)]
-    return *errors[:3], errors[3] + moved
+    errors = [_ROUNDINGS * quartic.EPS * norm**k for k in (1, 2, 3, 4)]
+    return *errors[:3], errors[3] + moved + error.at(farthest)
 
 
 VARIABLES = (
