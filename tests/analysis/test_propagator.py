@@ -15,7 +15,7 @@ from scipy.linalg import expm
 from drivetrain_jax.analysis.floquet.direct import Propagator, assemble
 from drivetrain_jax.analysis.floquet.multipliers import spectral_radius_bound
 from drivetrain_jax.analysis.floquet.propagator import ORDER, STAGES, Gauss, LinearTerm, march, monodromy
-from drivetrain_jax.analysis.numerics.collocation import first_order, gauss, panel, radau, second_order
+from drivetrain_jax.analysis.numerics.collocation import first_order, gauss, panel, radau, second_order, small_panel
 from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last, traced_once
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues
 from drivetrain_jax.systems import LinearPeriodic
@@ -141,6 +141,8 @@ def test_derivative_of_a_panel(scheme):
             value([e + sign * step * direction * (k == t) for k, e in enumerate(coefficients)]) for sign in (1, -1)
         )
         assert float(jnp.sum(gradient * direction)) == pytest.approx(float(ahead - behind) / (2 * step), rel=1e-8)
+    small = jax.value_and_grad(lambda e: jnp.sum(weights * small_panel(scheme, e)))(coefficients)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-11), small, (value(coefficients), gradients))
 
 
 @pytest.mark.parametrize("d", [3, 7])

@@ -30,6 +30,7 @@ from drivetrain_jax.analysis.floquet.direct import assemble
 from drivetrain_jax.analysis.floquet.effort import MAX_PANELS
 from drivetrain_jax.analysis.floquet.multipliers import sort_multipliers
 from drivetrain_jax.analysis.floquet.propagator import ORDER, Panels
+from drivetrain_jax.analysis.numerics.kernels import FULL_WIDTH
 from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, matmul
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic
@@ -58,7 +59,8 @@ def _marched(fixed: Constants, parameters: Any, count: Array) -> Array:
 
     def through(part: LinearPeriodic) -> Array:
         panels = Panels(part)
-        return jax.lax.fori_loop(0, count, lambda k, y: matmul(panels.propagator(panels.fixed, count, k), y), unit)
+        factor = partial(panels.propagator, panels.fixed, count, few=lanes <= FULL_WIDTH)
+        return jax.lax.fori_loop(0, count, lambda k, y: matmul(factor(k), y), unit)
 
     return jnp.stack([through(part) for part in form.parts])
 
@@ -85,12 +87,12 @@ def _pulled(fixed: Constants, arrays: tuple[Any, Array, Array], count: Array) ->
     short = -(-count // long)
     count = long * short
 
-    def panel(k: Array, parameters: Any) -> Array:
+    def factor(k: Array, parameters: Any) -> Array:
         panels = Panels(direct_form(build, parameters, constants).parts[number])
-        return panels.propagator(panels.fixed, count, k)
+        return panels.propagator(panels.fixed, count, k, lanes <= FULL_WIDTH)
 
     def onward(start: Array, length: Array, y: Array) -> Array:
-        return jax.lax.fori_loop(start, start + length, lambda k, y: matmul(panel(k, parameters), y), y)
+        return jax.lax.fori_loop(start, start + length, lambda k, y: matmul(factor(k, parameters), y), y)
 
     def interval(step: Array, carry: tuple[Array, Any, Array]) -> tuple[Array, Any, Array]:
         """First the states before the long intervals; then, for each of these from the last, before its panels."""
@@ -104,7 +106,7 @@ def _pulled(fixed: Constants, arrays: tuple[Any, Array, Array], count: Array) ->
 
         def back(j: Array, carry: tuple[Any, Array]) -> tuple[Any, Array]:
             i = short - 1 - j
-            matrix, pull = jax.vjp(partial(panel, k * short + i), parameters)
+            matrix, pull = jax.vjp(partial(factor, k * short + i), parameters)
             weight = jnp.sum(carry[1][:, :, None] * kept[1, i][None, None], axis=3)
             (more,) = jax.vmap(pull)(weight)
             earlier = jax.vmap(matmul, (None, 0))(jnp.swapaxes(matrix, 0, 1), carry[1])

@@ -23,7 +23,7 @@ from jax import Array
 from jax.extend.core import ClosedJaxpr, DebugInfo, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 
 from drivetrain_jax.analysis.floquet.direct import Monodromy, Propagator, compare, unknown
-from drivetrain_jax.analysis.numerics.collocation import Scheme, first_order, gauss, panel, second_order
+from drivetrain_jax.analysis.numerics.collocation import Scheme, first_order, gauss, panel, second_order, small_panel
 from drivetrain_jax.analysis.numerics.kernels import any_lane, in_one_kernel, on_cpu, stored, suits_one_kernel
 from drivetrain_jax.analysis.numerics.lanes import Constants, blocks_first, blocks_joined, lanes_last, traced_once
 from drivetrain_jax.analysis.numerics.linear_algebra import largest, matmul, square_sum
@@ -507,11 +507,15 @@ class Panels:
         self.suits = suits_one_kernel(lambda t: system.rows(*system.basis(t)), times)
         self.fixed = Fixed(split.fixed, jnp.asarray(system.span, float), jnp.asarray(1.0 if unit is None else unit))
 
-    def propagator(self, fixed: Fixed, count: Array, number: Array) -> Array:
-        """The propagator of one of ``count`` panels, ``(n, n, lanes)``."""
+    def propagator(self, fixed: Fixed, count: Array, number: Array, few: bool = False) -> Array:
+        """The propagator of one of ``count`` panels, ``(n, n, lanes)``, by a small program for ``few`` lanes."""
         h = fixed.span / count
         rows = jnp.where((np.arange(self.size) < self.d)[:, None], 1.0, h * fixed.unit)
-        return panel(self.scheme, self.coefficients(fixed, h, number), self.chain) * rows / rows[:, None]
+        coefficients = self.coefficients(fixed, h, number)
+        # For few lanes the compiler takes longer than the computation.
+        small = few and not self.chain
+        moved = small_panel(self.scheme, coefficients) if small else panel(self.scheme, coefficients, self.chain)
+        return moved * rows / rows[:, None]
 
     def through(self, fixed: Fixed, state: _State, count: Array, records: Array) -> _State:
         """The state after ``count`` panels; with ``records`` its covariance and stiffness too."""

@@ -292,6 +292,25 @@ def _by_coefficients(scheme: Scheme, elimination: Factors, weights: Array) -> It
         yield jnp.sum(adjoint[:, :, None] * values[:, None], axis=3)
 
 
+def small_panel(scheme: Scheme, coefficients: Sequence[Array]) -> Array:
+    """:func:`panel` as a loop over the unknowns: a small program, for few lanes, whose compilation takes longest."""
+    s, d = coefficients[0].shape[:2]
+    count, n = s * d, d * len(scheme.start)
+    inner = jnp.eye(count).reshape(s, d, s, d, 1)
+    right: Any = 0
+    for t, e in enumerate(coefficients):
+        inner = inner - scheme.inner[t][:, None, :, None, None] * e[:, :, None]
+        right = right + scheme.right[:, t].T[:, None, :, None, None] * e[:, :, None]
+    top = jnp.concatenate([inner.reshape(count, count, -1), right.reshape(count, n, -1)], axis=1)
+    bottom = np.concatenate([-np.kron(scheme.left, np.eye(d)), np.kron(scheme.start, np.eye(d))], axis=1)
+    bottom = jnp.broadcast_to(bottom[..., None], (n, count + n, top.shape[-1]))
+
+    def eliminated(matrix: Array, k: Array) -> tuple[Array, None]:
+        return matrix - matrix[:, k, None] * matrix[k] / matrix[k, k], None
+
+    return jax.lax.scan(eliminated, jnp.concatenate([top, bottom]), np.arange(count))[0][count:, count:]
+
+
 # Propagators of a linear periodic system along a coordinate x, as power series in x: a line costs as much as a few solves.
 #
 # Let ``y' = x B(t) y``. Over a part of the span the propagator is

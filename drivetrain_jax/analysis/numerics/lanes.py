@@ -120,8 +120,8 @@ def lanes_last(
 
     ``function`` has the lanes as an additional last axis of every array in ``varying`` and of its results. Values common to
     all lanes have a last axis of length 1; numbers have none. ``shared`` applies to all lanes: different integers become
-    their maximum, other values an array of lanes. With ``size``, ``function`` runs on blocks of this number of lanes and is
-    traced only for this number, once for equal ``constants``. A batch that fits into one vector is computed as a whole.
+    their maximum, other values an array of lanes. With ``size``, ``function`` runs on blocks of this number of lanes, once
+    traced for equal ``constants``. A single point, and a batch that fits into one vector, are computed as a whole.
     A cached trace of ``function`` for the ``expected`` number of lanes serves the single point, which jax traces before it
     batches.
     """
@@ -129,10 +129,10 @@ def lanes_last(
 
     @custom_vmap
     def call(varying: Any, shared: Any) -> Any:
-        # A single point is padded to a block, because it would need another trace.
         lanes = max(x.shape[-1] for x in jax.tree.leaves(varying))
         if lanes >= expected:
-            return at_once(varying, shared, size)
+            return at_once(varying, shared, size and (1 if lanes == 1 else size))
+        # A single point is padded to the expected batch, because it would need another trace.
         whole = jax.tree.map(lambda x: _padded(x, expected) if x.shape[-1] == lanes else x, varying)
         return jax.tree.map(lambda x: x[..., :lanes], at_once(whole, shared, size))
 
