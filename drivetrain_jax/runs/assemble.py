@@ -123,13 +123,26 @@ def blank(scene: Problem, grid: Grid, like: Arrays | None = None) -> Arrays:
     return arrays
 
 
-def labelled(scene: Scene, arrays: Mapping[str, np.ndarray], attrs: Mapping[str, str | float]) -> Labelled:
-    """The labelled result: dimensions are the axes in scene order (or ``point``), then those of the variable."""
+def labelled(scene: Scene, arrays: Arrays, attrs: Mapping[str, str | float]) -> Labelled:
+    """The labelled result: dimensions are the axes in scene order (or ``point``), then those of the variable.
+
+    Coordinates are the axes as the scene gives them, and the parameters that vary along them. The attribute ``parameter`` is
+    the key of a parameter in the scene if it differs from the name.
+    """
     sweep_dims = ("point",) if scene.zipped else tuple(axis.dim for axis in scene.axes)
+    coordinates = {}
+    if scene.zipped:
+        about = {"units": "1", "long_name": "position of the point in the lists"}
+        coordinates["point"] = Entry(("point",), np.arange(len(scene.axes[0].values)), about)
+    for axis in scene.axes:
+        for part in (*axis.given, *axis.together):
+            # Positions of swept entries count from 0.
+            entry = "" if part.entry is None else f", entry {part.entry}"
+            about = {"units": part.parameter.units, "long_name": f"{part.parameter.long_name}{entry}"}
+            about |= {} if part.name == part.own_dim else {"parameter": part.name}
+            coordinates[part.own_dim] = Entry(("point",) if scene.zipped else (axis.dim,), part.values, about)
     results = [(v, arrays[v.name]) for v in result_variables(scene)]
-    return Labelled.build(
-        sweep_dims, axis_coordinates(scene), scene.dimensions, results, result_attrs(scene) | dict(attrs)
-    )
+    return Labelled.build(sweep_dims, coordinates, scene.dimensions, results, result_attrs(scene) | dict(attrs))
 
 
 def with_pending(result: Labelled) -> Labelled:
@@ -144,23 +157,6 @@ def with_pending(result: Labelled) -> Labelled:
 def to_dataset(scene: Scene, arrays: Arrays, attrs: Mapping[str, str | float]) -> xr.Dataset:
     """The labelled result as a Dataset."""
     return labelled(scene, arrays, attrs).to_dataset()
-
-
-def axis_coordinates(scene: Scene) -> dict[str, Entry]:
-    """The axes as the scene gives them, and the parameters that vary along them.
-
-    The attribute ``parameter`` is the key of a parameter in the scene if it differs from the name.
-    """
-    coordinates = {}
-    if scene.zipped:
-        about = {"units": "1", "long_name": "position of the point in the lists"}
-        coordinates["point"] = Entry(("point",), np.arange(len(scene.axes[0].values)), about)
-    for axis in scene.axes:
-        for part in (*axis.given, *axis.together):
-            named = {} if part.name == part.own_dim else {"parameter": part.name}
-            about = {"units": part.parameter.units, "long_name": part.long_name, **named}
-            coordinates[part.own_dim] = Entry(("point",) if scene.zipped else (axis.dim,), part.values, about)
-    return coordinates
 
 
 def _finite(value: Any) -> Any:
@@ -239,11 +235,6 @@ class ZarrBlocks:
 
     job: Job
     place: str
-
-    @classmethod
-    def among(cls, parts: PartsFolder, job: Job) -> ZarrBlocks:
-        """The growing store among the parts."""
-        return cls(job, os.path.abspath(parts.path / zarr_store.UNFINISHED))
 
     def create(self) -> None:
         """Create the store; renew all but the shards of one that a stopped run has left, whose metadata may be damaged."""

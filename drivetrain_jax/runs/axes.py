@@ -72,12 +72,6 @@ class Axis:
         """All parameters that vary along this axis, itself the first."""
         return (self, *self.also)
 
-    @property
-    def long_name(self) -> str:
-        """Long name of the parameter, with the position of a swept entry, counted from 0."""
-        label = self.parameter.long_name
-        return label if self.entry is None else f"{label}, entry {self.entry}"
-
 
 def axis_table(parameter: Parameter, name: str, keys: Any, where: str, *, keep: bool) -> tuple[AxisTable, Parameter]:
     """The checked ``keys`` of an axis with numbers for texts such as ``"200 rpm"``, and the parameter in their unit.

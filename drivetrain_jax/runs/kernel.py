@@ -54,7 +54,8 @@ class Kernel:
         if count < self.chunk:
             columns = {name: np.pad(values, (0, self.chunk - count), mode="edge") for name, values in columns.items()}
         with self.turn:
-            results = self.compiled(columns, _arrays(numbers), np.int64(effort))
+            fixed = {name: np.float64(value) for name, value in numbers.items()}
+            results = self.compiled(columns, fixed, np.int64(effort))
             results = {name: np.moveaxis(np.asarray(value), -1, 0)[:count] for name, value in results.items()}
         return {v.name: np.ascontiguousarray(results[v.name], dtype=v.dtype) for v in self.variables}
 
@@ -73,11 +74,8 @@ def _batch(
         return {n: jnp.broadcast_to(v, (*v.shape[:-1], chunk)) for n, v in spread.items()}
 
     columns = {part.name: jax.ShapeDtypeStruct((chunk,), part.values.dtype) for part in grid.varying}
-    return batch, (columns, _arrays(grid.numbers), jax.ShapeDtypeStruct((), np.int64))
-
-
-def _arrays(numbers: Mapping[str, float]) -> dict[str, np.float64]:
-    return {name: np.float64(value) for name, value in numbers.items()}
+    numbers = {name: np.float64(value) for name, value in grid.numbers.items()}
+    return batch, (columns, numbers, jax.ShapeDtypeStruct((), np.int64))
 
 
 def result_shapes(problem: Problem, grid: Grid, solver: Solver) -> dict[str, tuple[int, ...]]:

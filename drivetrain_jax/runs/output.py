@@ -71,6 +71,9 @@ class Output:
         is_store = zarr_store.is_store(self.out)
         self.store = store or (ZARR if is_store else self.unfinished.get("store", HDF5))
         self._files: Any = zarr_store if self.store == ZARR else consolidate
+        # The store of unfinished work.
+        growing = os.path.abspath(self.parts.path / zarr_store.UNFINISHED)
+        self.blocks: BlockStore = ZarrBlocks(job, growing) if self.store == ZARR else self.parts
         if self.out.is_dir() and not (is_store and self.store == ZARR):
             raise self.error("is a folder; expected the path of a file")
         if self.out.exists() and not self.out.is_dir() and not (self.out.is_file() and self.store == HDF5):
@@ -213,11 +216,6 @@ class Output:
             )
         return reused
 
-    @property
-    def blocks(self) -> BlockStore:
-        """The store of unfinished work."""
-        return ZarrBlocks.among(self.parts, self.job) if self.store == ZARR else self.parts
-
     def finished(self) -> Iterator[tuple[np.ndarray, Results]]:
         """Yield points and results of unfinished work, reused ones included."""
         if self.unfinished:
@@ -225,7 +223,8 @@ class Output:
             reused = combined(self.job, [find(self.job, self.out.parent / name) for name in names])
         else:
             reused = self.reused_points((), fresh=False)
-        yield from reused.blocks()
+        for source in reused.sources:
+            yield from source.blocks()
         for block, results in stored_blocks(self.blocks, self.job, reused.others(self.job.grid.size)):
             yield self.job.points(block), results
 

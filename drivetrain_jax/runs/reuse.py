@@ -88,11 +88,6 @@ class ReusedPoints:
         sources = " ".join(source.digest for source in self.sources)
         return {"reused_points": self.count, "reused_from": sources} if sources else {}
 
-    def blocks(self) -> Iterator[tuple[np.ndarray, Results]]:
-        """Yield the reused points and their results in blocks."""
-        for source in self.sources:
-            yield from source.blocks()
-
     def others(self, size: int) -> np.ndarray | None:
         """The other ones of ``size`` points; None if nothing is reused."""
         if not self.sources:

@@ -13,7 +13,7 @@ from concurrent.futures import Future
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Protocol
@@ -439,7 +439,7 @@ class Route:
         self, job: Job, buffer: ResultBuffer, work: Work, progress: Progress, reused: ReusedPoints
     ) -> dict[str, str | int]:
         """Copy the points ``reused`` and solve the others; returns attributes of the result."""
-        for points, results in reused.blocks():
+        for points, results in chain.from_iterable(source.blocks() for source in reused.sources):
             buffer.fill(points, results)
             progress.reused += results[OUTCOME.name].size
             progress.count(results[OUTCOME.name])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import io
 import json
 import math
@@ -12,6 +11,7 @@ import shutil
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,7 @@ class PartsFolder:
         file = io.BytesIO()
         np.savez(file, **results)  # pyright: ignore[reportArgumentType]
         data = file.getbuffer()
-        path = self.path / f"{number:08d}-{_digest(data)}.npz"
+        path = self.path / f"{number:08d}-{blake2b(data, digest_size=16).hexdigest()}.npz"
         write_atomic(path, data, path.with_suffix(f".{os.getpid()}.tmp"))
 
     def read(self, number: int) -> Arrays | None:
@@ -63,7 +63,7 @@ class PartsFolder:
             # Content with the digest of its name may still be no archive, for which NumPy raises exceptions of many kinds.
             with suppress(Exception):
                 data = path.read_bytes()
-                if _digest(data) == path.stem.partition("-")[2]:
+                if blake2b(data, digest_size=16).hexdigest() == path.stem.partition("-")[2]:
                     with np.load(io.BytesIO(data)) as file:
                         return dict(file)
         return None
@@ -134,10 +134,6 @@ class PartsFolder:
             shutil.rmtree(self.path, ignore_errors=True)
         self._lock.release()
         self._lock = None
-
-
-def _digest(data: bytes | memoryview) -> str:
-    return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
 Place = tuple[slice, ...]
