@@ -277,7 +277,8 @@ def shoot(field: Field, period: float, n: int, rtol: float) -> Orbit:
     search: dict[str, Any] = {"direction": jnp.ones(1), "longest": _WHOLE, "limits": (0.0, 1.0)}
     rest, unit = jnp.zeros((n + 1, 1)), jnp.ones((n + 1, 1))
     guess = _guesses(period_map(forced, _RTOL, _MOST), rest, unit, jnp.ones(()), 1, **search)
-    return corrected(field, guess[0, :, 0], period, rtol)
+    # Newton's method gives the derivatives of the orbit.
+    return corrected(field, jax.lax.stop_gradient(guess[0, :, 0]), period, rtol)
 
 
 def speed_map(model_at: Callable[[Any], ForcedModel], rtol: float, most: int) -> PeriodMap:
