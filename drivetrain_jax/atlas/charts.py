@@ -150,8 +150,10 @@ def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
     def dense(first, columns, spread, error, values, fixed, rtol):
         parts = quartic.blocks(jnp.moveaxis(first @ columns, 1, 0))
         at_nodes, rounding, changes = (jnp.stack(x, axis=1) for x in in_one_kernel(quartic.invariants)(parts, error))
-        # An error of Phi changes each cell as much as its own derivatives say, rounding of the nodes is spread.
-        bounds = _largest(changes) + _SPREAD * jnp.max(rounding, axis=-1) + _left_out(at_nodes)
+        series, slopes = (jnp.abs(x @ analysis_matrix(NODES).T) for x in (at_nodes, changes))
+        # An error of Phi changes each cell as much as its own derivatives say, bounded by the sum of their coefficients;
+        # rounding of the nodes is spread; twice the last coefficients bound what the nodes leave out.
+        bounds = jnp.sum(slopes, -1) + _SPREAD * jnp.max(rounding, -1) + 2 * jnp.sum(series[..., -3:], -1)
 
         def row(inputs: tuple[Array, Array, Array]) -> dict[str, Array]:
             e, bounds, value = inputs
@@ -162,16 +164,6 @@ def tile_kernel(build: Build, names: tuple[str, ...], kind: str) -> Any:
         return by_rows(row, (at_nodes, bounds, values[names[-2]]))
 
     return jax.jit(dense if kind == "dense" else sparse, compiler_options=compiler_options())
-
-
-def _left_out(e: Array) -> Array:
-    """Bound of the truncation error of interpolating ``e`` ``(R, 3, NODES)``, ``(R, 3)``: twice the last coefficients."""
-    return 2 * jnp.sum(jnp.abs(e @ analysis_matrix(NODES)[-3:].T), axis=-1)
-
-
-def _largest(values: Array) -> Array:
-    """Bound of functions between the nodes ``(R, 3, NODES)``, ``(R, 3)``: the sum of their coefficients."""
-    return jnp.sum(jnp.abs(values @ analysis_matrix(NODES).T), axis=-1)
 
 
 def exact_verdict(model: FloquetModel, phi: quartic.Blocks, value_error: Array) -> Array:

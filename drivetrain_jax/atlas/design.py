@@ -67,28 +67,9 @@ class Check:
         return within and not self.beyond <= 1
 
 
-@dataclass(frozen=True)
-class End:
-    """An end ``value`` of a stable interval of length ``length`` on the ``inward`` side (a sign)."""
-
-    value: float
-    crossing: Crossing | None
-    inward: float
-    length: float
-
-    @classmethod
-    def of(cls, interval: Interval, inward: float) -> End:
-        """The lower or the upper end of ``interval``."""
-        return cls(*interval.ends[0 if inward > 0 else 1], inward, interval.upper - interval.lower)
-
-    def step(self, span: float) -> float:
-        """Distance of the check from the end: outside the error, over a range of length ``span``."""
-        error = self.crossing.error if self.crossing else 0.0
-        return max(error, _LEAST * span) if math.isfinite(error) else _PART * span
-
-
-def check_ends(ends: list[End], line: Line, criteria: Criteria, direct: Direct) -> Check | None:
-    """Check all ``ends`` of stable intervals of ``line`` by direct solves just inside and just beyond; None without ends.
+def check_ends(ends: list[tuple[Interval, float]], line: Line, criteria: Criteria, direct: Direct) -> Check | None:
+    """Check ``ends`` of stable intervals of ``line``, each with the sign of its inward side, by direct solves just inside
+    and just beyond; None without ends.
 
     Inside, the solves cover the whole range of the other coordinate. On both sides, two lie at the maximum of the surrogate
     over the whole range, and about the crossing.
@@ -98,12 +79,14 @@ def check_ends(ends: list[End], line: Line, criteria: Criteria, direct: Direct) 
     other, span = part.parameters[1 - k], float(part.upper[k] - part.lower[k])
     within = np.linspace(part.lower[1 - k], part.upper[1 - k], _SAMPLES)
     points, outer = [], []
-    for end in ends:
-        step = end.step(span)
-        inner, value = end.value + end.inward * min(step, end.length / 2), end.value - end.inward * step
-        points += [(x, inner) for x in (*within, *_worst(criteria, k, inner, end.crossing))]
-        if end.crossing and _unstable(line, value):
-            outer += [(x, value) for x in _worst(criteria, k, value, end.crossing)]
+    for interval, inward in ends:
+        end, crossing = interval.ends[0 if inward > 0 else 1]
+        error = crossing.error if crossing else 0.0
+        step = max(error, _LEAST * span) if math.isfinite(error) else _PART * span
+        inner, value = end + inward * min(step, (interval.upper - interval.lower) / 2), end - inward * step
+        points += [(x, inner) for x in (*within, *_worst(criteria, k, inner, crossing))]
+        if crossing and _unstable(line, value):
+            outer += [(x, value) for x in _worst(criteria, k, value, crossing)]
     if not points:
         return None
     columns = np.array(points + outer).T
@@ -360,7 +343,7 @@ def _extreme(atlas: Atlas, system: type[System], speeds: Range, side: float, dir
     # Ends to check: the end that is the answer; without an answer both ends of every stable interval.
     stated = answer.stable if answer.value is None else (line.intervals[-1 if side > 0 else 0],)
     sides = (1.0, -1.0) if answer.value is None else (side,)
-    ends = [End.of(interval, inward) for interval in stated for inward in sides]
+    ends = [(interval, inward) for interval in stated for inward in sides]
     return replace(answer, check=check_ends(ends, line, Criteria.of(part, system), direct))
 
 

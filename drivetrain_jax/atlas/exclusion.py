@@ -54,7 +54,8 @@ def critical_points(patches: tuple[Patches, ...], number: int, horizontal: int) 
     roots, undecided = [], []
     active, others = patches[number], patches[:number] + patches[number + 1 :]
     while len(active):
-        keep = ~_excluded_by_value(active, others)
+        low, high = active.range()
+        keep = ~((low > 0) | (high < 0) | np.any([p.range()[1] < 0 for p in others], axis=0))
         active, others = active.take(keep).trim(), tuple(p.take(keep).trim() for p in others)
         bundle = _Bundle(active, horizontal)
         unclear = ~np.isfinite(active.error)
@@ -78,14 +79,6 @@ def critical_points(patches: tuple[Patches, ...], number: int, horizontal: int) 
     points, curvature, slope, boxes = (part[~beyond] for part in (points, curvature, slope, boxes))
     keep = _distinct(points, boxes)
     return Search(points[keep], curvature[keep], slope[keep], np.concatenate(undecided))
-
-
-def _excluded_by_value(active: Patches, others: tuple[Patches, ...]) -> np.ndarray:
-    low, high = active.range()
-    excluded = (low > 0) | (high < 0)
-    for patches in others:
-        excluded |= patches.range()[1] < 0
-    return excluded
 
 
 class _Bundle:

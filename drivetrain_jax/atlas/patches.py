@@ -13,6 +13,7 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebder
 
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes, on_grid, restriction
@@ -73,11 +74,10 @@ class Patches:
 
     def derivative(self, axis: int) -> Patches:
         """The patches of the derivative along a coordinate."""
-        matrix = _differentiation(self.coefficients.shape[axis])
         # Patches without extent have derivatives that are not finite and decide nothing.
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = 2 / (self.upper[:, axis] - self.lower[:, axis])
-            coefficients = _apply(matrix, self.coefficients, axis) * scale
+            coefficients = chebder(self.coefficients, axis=axis) * scale
         nothing = np.zeros((*(1,) * self.dimension, len(self)))
         return replace(self, coefficients=coefficients, lever=nothing, floor=self.error * self.roughness[:, axis])
 
@@ -281,14 +281,6 @@ def _apply(matrix: np.ndarray, coefficients: np.ndarray, axis: int) -> np.ndarra
     # Derivatives over patches without extent are not finite.
     with np.errstate(invalid="ignore"):
         return np.moveaxis(np.tensordot(matrix, coefficients, axes=((1,), (axis,))), 0, axis)
-
-
-@lru_cache
-def _differentiation(n: int) -> np.ndarray:
-    """Matrix from the coefficients of a polynomial to those of its derivative (of the same length)."""
-    matrix = np.zeros((n, n))
-    matrix[: n - 1] = np.polynomial.chebyshev.chebder(np.eye(n), axis=0)
-    return matrix
 
 
 @lru_cache

@@ -43,19 +43,11 @@ _ROOM = 1.01
 _quiet = np.errstate(divide="ignore", over="ignore", invalid="ignore")
 
 
-class _NoProof(Exception):
-    """Nothing is proved, with the reason."""
-
-
 def with_proofs(atlas: Atlas, system: type[System]) -> tuple[Atlas, str]:
     """``atlas`` with proved bounds for its panels where there are any, and the reason if a panel has none."""
-    panels, reason = [], ""
-    for panel in atlas.panels:
-        try:
-            panels.append(replace(panel, proved_error=_ROOM * _bound(atlas, panel, system)))
-        except _NoProof as none:
-            panels, reason = [*panels, panel], str(none)
-    return replace(atlas, panels=tuple(panels)), reason
+    bounds = [proved_error(atlas, panel, system) for panel in atlas.panels]
+    panels = tuple(replace(p, proved_error=_ROOM * bound) for p, (bound, _) in zip(atlas.panels, bounds, strict=True))
+    return replace(atlas, panels=panels), next((reason for _, reason in bounds if reason), "")
 
 
 def is_proved(atlas: Atlas) -> bool:
@@ -71,21 +63,15 @@ def summary(proved: np.ndarray, where: str) -> str:
     return f"the verdicts of {'all' if count == total else f'{count:,} of'} {total:,} {where} are proved"
 
 
-def proved_error(atlas: Atlas, panel: Panel, system: type[System]) -> float:
-    """A proved bound of the Frobenius norm of the error of ``panel`` anywhere in its box; infinite if there is none."""
-    try:
-        return _bound(atlas, panel, system)
-    except _NoProof:
-        return math.inf
-
-
-def _bound(atlas: Atlas, panel: Panel, system: type[System]) -> float:
+def proved_error(atlas: Atlas, panel: Panel, system: type[System]) -> tuple[float, str]:
+    """A proved bound of the Frobenius norm of the error of ``panel`` anywhere in its box; infinite, with the reason, if
+    there is none."""
     enclosure = smoothness(system).enclosure
     if enclosure is None:
-        raise _NoProof(f"{system.name} has no enclosure of its propagators")
+        return math.inf, f"{system.name} has no enclosure of its propagators"
     if not set(enclosure.varying).issuperset(atlas.parameters):
         over, among = (", ".join(names) for names in (atlas.parameters, enclosure.varying))
-        raise _NoProof(f"the atlas varies {over}; a proof allows {among}")
+        return math.inf, f"the atlas varies {over}; a proof allows {among}"
     ranges = dict(zip(atlas.parameters, zip(atlas.lower, atlas.upper, strict=True), strict=True))
     domain = floquet_domain(system, ranges, atlas.fixed)
     margin = _BEYOND * (panel.upper - panel.lower)
@@ -95,10 +81,10 @@ def _bound(atlas: Atlas, panel: Panel, system: type[System]) -> float:
     needed, truncated = polynomials_needed(system, domain, _TRUNCATED, lower, upper)
     if not (np.isfinite(truncated) and math.prod(needed) <= _MOST_NODES):
         wanted = f"{math.prod(needed):,}" if np.isfinite(truncated) else "too many"
-        raise _NoProof(f"a proof would need {wanted} polynomials, more than {_MOST_NODES:,}")
+        return math.inf, f"a proof would need {wanted} polynomials, more than {_MOST_NODES:,}"
     corners = np.stack(np.meshgrid(*np.stack([atlas.lower, atlas.upper]).T), axis=-1).reshape(-1, len(needed))
     if _log_determinant(enclosure, atlas, corners).min() < _STRONG:
-        raise _NoProof("the damping is too strong for a proof")
+        return math.inf, "the damping is too strong for a proof"
     axes, factor = {}, 1.0
     for k, name in enumerate(atlas.parameters):
         # A polynomial of degree n is at most 1/cos(n pi/2N) times its largest value at N nodes.
@@ -121,9 +107,7 @@ def _bound(atlas: Atlas, panel: Panel, system: type[System]) -> float:
     parts = [{**axes, cut: part} for part in cuts] or [axes]
     largest = max(distance for _, distance in in_threads(parts, apart))
     bound = (factor * (largest + truncated) + truncated) * (1 + 1e-9)
-    if not np.isfinite(bound):
-        raise _NoProof("rounding is too large for a proof")
-    return bound
+    return (bound, "") if np.isfinite(bound) else (math.inf, "rounding is too large for a proof")
 
 
 # Radii of the ellipses on which the growth is bounded, arcs of half an ellipse, and too many polynomials.

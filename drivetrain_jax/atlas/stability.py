@@ -188,7 +188,11 @@ class StabilityAtlas:
             _store(results, tile, cells)
             for tile, cells in charts.evaluated_tiles(cut, axes, names, self.atlas.fixed, kernel, self.rtol)
         ]
-        self._repair(results, axes, np.concatenate([np.empty((0, len(axes)), int), *again]))
+        unsure = np.concatenate([np.empty((0, len(axes)), int), *again])
+        for part in (unsure[i : i + (1 << 18)] for i in range(0, len(unsure), 1 << 18)):
+            points = np.stack([axis[part[:, k]] for k, axis in enumerate(axes)], axis=-1)
+            for name, value in self.by_eigenvalues(points, [name for name in results if name != OUTCOME.name]).items():
+                results[name][tuple(part.T)] = value
         if (lost := results[OUTCOME.name] == Outcome.LOST).any():
             for name, values in results.items():
                 values[lost] = _nothing(name, values)
@@ -197,13 +201,6 @@ class StabilityAtlas:
         """True if the system is Hamiltonian in any cell; ``columns`` are broadcast against each other."""
         model = self.build({**self.atlas.fixed, **dict(zip(self.atlas.parameters, columns, strict=True))})
         return model.hamiltonian is not None and bool(np.any(model.hamiltonian()))
-
-    def _repair(self, results: dict[str, np.ndarray], axes: list[np.ndarray], cells: np.ndarray) -> None:
-        outputs = [name for name in results if name != OUTCOME.name]
-        for part in (cells[i : i + (1 << 18)] for i in range(0, len(cells), 1 << 18)):
-            points = np.stack([axis[part[:, k]] for k, axis in enumerate(axes)], axis=-1)
-            for name, value in self.by_eigenvalues(points, outputs).items():
-                results[name][tuple(part.T)] = value
 
     def _exact_results(
         self, number: int, points: np.ndarray, phi: np.ndarray, outputs: tuple[str, ...]

@@ -515,7 +515,7 @@ def verify_proof(path: Path) -> tuple[str, str]:
     if not proved:
         reason = proof.with_proofs(atlas, system)[1] or "run its scene again"
         return "proof: none in this file", f"holds no proof; {reason}"
-    errors = [(proof.proved_error(atlas, panel, system), panel.proved_error) for panel in proved]
+    errors = [(proof.proved_error(atlas, panel, system)[0], panel.proved_error) for panel in proved]
     computed, claimed = max(errors, key=lambda pair: pair[0] / pair[1])
     lines = f"proof: errors of {len(proved)} of {len(atlas.panels)} panels at most {computed:.2e}, stored {claimed:.2e}"
     wrong = f"proved_error = {claimed:.2e}: the proof gives {computed:.2e}; compute the file again"
