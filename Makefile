@@ -21,7 +21,7 @@ test: $(VENV)/installed-test lint  ## all tests in their short form
 validate: $(VENV)/installed-test  ## the comparisons at full size
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m full
 
-faults: $(VENV)/installed-test  ## faults at every system call; writes the table of docs/reliability.md
+faults: $(VENV)/installed-test  ## kills, failing writes and damaged bytes at random; writes the table of docs/reliability.md
 	$(BIN)/python tests/faults/crashes.py
 	$(BIN)/python -m pytest -m full tests/runs/test_resume_machine.py
 

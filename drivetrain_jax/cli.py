@@ -53,6 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         warnings.formatwarning = lambda message, *_, **__: one_line(f"warning: {message}")
         # Ctrl-C ends a command at once, also during a compilation; ``run`` has a handler of its own.
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+        quiet_hdf5()
     # A stream that the parent process has closed is None.
     sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr) if arguments is None else ():
@@ -90,6 +91,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if arguments is None:
             # Skip Python's garbage collection at exit, which takes a third of a second.
             gc.freeze()
+
+
+def quiet_hdf5() -> None:
+    """Leave out what h5py prints about objects that it frees after a failed write; the failure itself is raised."""
+
+    def quiet(former: Callable[..., None], error_of: Callable[..., Any], *given: Any) -> None:
+        if "decrement id ref count" not in str(error_of(*given)):
+            former(*given)
+
+    sys.excepthook = partial(quiet, sys.excepthook, lambda _, error, *__: error)
+    sys.unraisablehook = partial(quiet, sys.unraisablehook, lambda unraisable: unraisable.exc_value)
 
 
 def one_line(message: str) -> str:

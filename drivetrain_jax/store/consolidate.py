@@ -10,6 +10,7 @@ import mmap
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -234,7 +235,9 @@ class ResultFile:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._temporary.unlink(missing_ok=True)
+        # A finished file stays finished.
+        with suppress(OSError):
+            self._temporary.unlink(missing_ok=True)
 
     def lay_out(self, template: Labelled) -> Mapping[str, np.ndarray]:
         """Reserve space for the data of ``template``, whose content is ignored (a broadcast zero takes no memory).

@@ -9,13 +9,14 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import pytest
 import xarray as xr
 
 from drivetrain_jax import ChunkError, InputError, __version__
-from drivetrain_jax.cli import _reading, main, progress_line
+from drivetrain_jax.cli import _reading, main, progress_line, quiet_hdf5
 from drivetrain_jax.runs.work import Progress
 from drivetrain_jax.systems import get_system
 from tests.sizes import full_after
@@ -602,6 +603,17 @@ def test_version_and_help(cli):
     assert cli("--version")[1].strip() == __version__
     code, out, _ = cli("--help")
     assert code == 0 and all(name in out for name in ("list", "run", "status", "verify", "plot", "point"))
+
+
+def test_h5py_is_quiet_about_objects_after_a_failed_write(monkeypatch):
+    told = []
+    monkeypatch.setattr(sys, "excepthook", lambda _, error, __: told.append(str(error)))
+    monkeypatch.setattr(sys, "unraisablehook", lambda unraisable: told.append(str(unraisable.exc_value)))
+    quiet_hdf5()
+    for text in ("Can't decrement id ref count (file write failed)", "another error"):
+        sys.excepthook(RuntimeError, RuntimeError(text), None)
+        sys.unraisablehook(SimpleNamespace(exc_value=RuntimeError(text)))
+    assert told == ["another error", "another error"]
 
 
 def test_help_is_light():

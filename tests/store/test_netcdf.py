@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+from pathlib import Path
+
 import h5py
 import netCDF4
 import numpy as np
@@ -9,7 +12,7 @@ import pytest
 import xarray as xr
 
 from drivetrain_jax._quantities import Dimension, Variable
-from drivetrain_jax.store.consolidate import Entry, Labelled, write_result
+from drivetrain_jax.store.consolidate import Entry, Labelled, ResultFile, write_result
 
 OWN = {"_NCProperties", "checksums"}
 
@@ -111,3 +114,13 @@ def test_lengths_that_disagree_are_refused():
     labelled = Labelled.build((), {}, (Dimension("k", "name", ("up", "down")),), results, {})
     with pytest.raises(ValueError, match="f: length 3 along 'k', which has length 2"):
         _ = labelled.sizes
+
+
+def test_a_finished_file_stays_finished_on_a_failing_disk(tmp_path, monkeypatch):
+    """An export whose file was in place ended with an error, and could not be repeated."""
+
+    def unlink(*_, **__):
+        raise OSError(errno.EIO, "Input/output error")
+
+    with ResultFile(tmp_path / "r.tmp"):
+        monkeypatch.setattr(Path, "unlink", unlink)
