@@ -193,7 +193,7 @@ def ranges_text(axis: xr.DataArray, holds: np.ndarray) -> str:
     return runs_text(axis, [(axis.values[a], axis.values[b - 1]) for a, b in zip(edges[::2], edges[1::2], strict=True)])
 
 
-def runs_text(axis: xr.DataArray, runs: Sequence[Sequence[float]]) -> str:
+def runs_text(axis: xr.DataArray, runs: Sequence[Any] | np.ndarray) -> str:
     """Ranges of ``axis`` as text, the first ones of many."""
     shown = [f"{a:.6g}" if a == b else f"{a:.6g} to {b:.6g}" for a, b in runs[:MOST_RANGES]]
     more = f" and {len(runs) - MOST_RANGES} more ranges" if len(runs) > MOST_RANGES else ""

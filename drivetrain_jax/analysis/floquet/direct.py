@@ -141,7 +141,7 @@ def compare(
     plain = z_fine, z_fine - z_coarse
     z_fine, z_coarse, size = (stored(_scaled)(matrix, scales) for matrix in (z_fine, z_coarse, size))
     norm = jnp.sqrt(square_sum(size))
-    centre = sum(z_fine[i, i] for i in range(n)) / n
+    centre = jnp.asarray(sum(z_fine[i, i] for i in range(n))) / n
     shift = centre * np.eye(n).reshape(n, n, *(1,) * centre.ndim)
     a_fine, slopes = stored(characteristic_polynomial)(z_fine - shift)
     a_coarse = stored(characteristic_coefficients)(z_coarse - shift)
@@ -165,7 +165,7 @@ def compare(
     grown = jnp.sqrt(jnp.maximum(fine.growth**2 / square, 1.0)) * unit
     of_entries = _ENTRIES * fine.stiffness * (halves * np.finfo(float).eps + jnp.minimum(fine.squared, 1.0) * unit)
 
-    def rounding(slope: Array) -> Array:
+    def rounding(slope: Array | float) -> Array:
         """An error of Z as large as a rounding of its terms changes a coefficient by its slope."""
         of_products = (1 + jnp.sqrt(steps) / 2) * slope * grown
         return of_products + jnp.minimum(steps / 2 * slope * grown, difference)

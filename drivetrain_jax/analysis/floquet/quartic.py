@@ -190,7 +190,7 @@ def factors(c: Coefficients) -> tuple[_Factor, _Factor]:
     return one, two
 
 
-def farthest(split: tuple[_Factor, _Factor], centre: Array) -> Array:
+def farthest(split: tuple[_Factor, _Factor], centre: Array | float) -> Array:
     """The largest distance of the four roots from ``centre``."""
     squares = []
     for factor in split:
