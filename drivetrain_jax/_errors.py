@@ -39,11 +39,11 @@ def counted(count: int, one: str, many: str) -> str:
     return f"{count} {one if count == 1 else many}"
 
 
-def written(value: Any) -> str:
-    """A parameter's value as text: up to ten digits, a list in brackets."""
+def written(value: Any, digits: int = 10) -> str:
+    """A parameter's value as text: up to ten ``digits``, a list in brackets."""
     if isinstance(value, tuple):
-        return "[" + ", ".join(map(written, value)) + "]"
-    return f"{value:.10g}" if isinstance(value, float) else str(value)
+        return "[" + ", ".join(written(entry, digits) for entry in value) + "]"
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:

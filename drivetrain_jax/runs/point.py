@@ -134,16 +134,17 @@ class PointResult:
     def _lines(self) -> list[str]:
         # An empty list is the default "none".
         parameters = ", ".join(
-            _with_units(f"{n} = {written(v)}", self.parameter_units[n]) for n, v in self.parameters.items() if v != ()
+            _with_units(f"{n} = {written(v, _PROSE)}", self.parameter_units[n])
+            for n, v in self.parameters.items()
+            if v != ()
         )
         listed = [n for n, v in self.values.items() if np.ndim(v) == 1]
         matrices = [n for n, v in self.values.items() if np.ndim(v) == 2]
         plain = [name for name in self.values if name not in (*listed, *matrices)]
         width = max(map(len, (*plain, "outcome")))
-        lines = [f"{self.system} {self.analysis} (method {self.method}), {parameters}"]
-        if self.physical:
-            data = (_with_units(f"{n} = {written(v)}", units) for n, (v, units) in self.physical.items())
-            lines.append(f"  from {', '.join(data)}")
+        data = (_with_units(f"{n} = {written(v, _PROSE)}", units) for n, (v, units) in self.physical.items())
+        lines = [f"{self.system} {self.analysis} (method {self.method}), {', '.join(data) or parameters}"]
+        lines += [f"  that is {parameters}"] if self.physical else []
         for name in plain:
             text = _text(self.variables[name], self.values[name])
             near = self.advice and self.outcome.has_value and text.startswith("undecided ")
@@ -351,6 +352,8 @@ def _labels(job: Job, values: Mapping[str, Any], buffer: ResultBuffer) -> dict[s
     return {d.name: d.labels(sizes[d.name]) for d in job.scene.dimensions if d.name in sizes}
 
 
+# Digits of given values in an answer.
+_PROSE = 6
 # Most modes in the sentence about an order.
 _FIRST = 6
 
