@@ -236,7 +236,8 @@ def point(
         job = resolve(load_scene(tree))
     except InputError as error:
         # Messages name the fields without the tables of a scene.
-        raise InputError(re.sub(r"^(points|fixed|options)\.", "", str(error))) from None
+        text = re.sub(r"^(points|fixed|options)\.", "", str(error))
+        raise InputError(re.sub(r"^(\w+)\.values = \[(.*?)\]:", r"\1 = \2:", text)) from None
     if sensitivities and "floquet" not in job.scene.system.models:
         raise InputError(f"sensitivities: {system} has no spectral radius; allowed for floquet")
     limit = None if amplitude is None else Limit.from_text(job.scene.system, amplitude)

@@ -152,7 +152,7 @@ def test_another_point_needs_no_new_compilation():
         ({"a": 1, "outputs": ["nothing"]}, "^outputs: 'nothing'"),
         ({"a": 1, "outputs": 5}, "^outputs = 5: expected `array"),
         ({"a": 1, "outputs": True}, "^outputs = True: expected `array"),
-        ({"a": 1j}, "^a = 1j: expected a number"),
+        ({"a": 1j}, "^a = 1j: expected `int"),
     ],
 )
 def test_wrong_input_is_one_clear_line(given, part):
