@@ -21,6 +21,7 @@ from drivetrain_jax.analysis.floquet.multipliers import (
     PolynomialError,
     characteristic_coefficients,
     characteristic_polynomial,
+    root,
     root_scale,
 )
 from drivetrain_jax.analysis.numerics.kernels import stored
@@ -145,8 +146,10 @@ def compare(
     shift = centre * np.eye(n).reshape(n, n, *(1,) * centre.ndim)
     a_fine, slopes = stored(characteristic_polynomial)(z_fine - shift)
     a_coarse = stored(characteristic_coefficients)(z_coarse - shift)
-    # The mean of the multipliers is at most as large as the largest, and no farther from it than the sum of both.
-    scale = jnp.maximum(jnp.abs(centre), root_scale(a_fine) - jnp.abs(centre))
+    determinant = (-1) ** n * reduce(lambda total, a: a - total * centre, a_fine, 1.0)
+    # The largest multiplier is as large as each mean, and at most that much nearer to 0 than to the centre.
+    means = jnp.abs(centre), root_scale(a_fine) - jnp.abs(centre), root(jnp.abs(determinant), n)
+    scale = reduce(jnp.maximum, means)
     log_scale = halves * fine.log_scale
     apart = z_fine - z_coarse
     square = square_sum(fine.matrix)
@@ -157,7 +160,6 @@ def compare(
     difference = 4 * reduce(jnp.maximum, changes, relative)
     residual = jnp.zeros_like(scale)
     if log_determinant is not None:
-        determinant = (-1) ** n * reduce(lambda total, a: a - total * centre, a_fine, 1.0)
         residual = (determinant - jnp.exp(log_determinant - n * log_scale)) / scale**n
     lost = jnp.maximum(jnp.abs(residual), jnp.exp(halves * (fine.undamped - fine.log_scale)) / scale)
     truncation = jnp.maximum(difference / (gain - 1), lost)

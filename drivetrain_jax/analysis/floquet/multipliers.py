@@ -65,12 +65,17 @@ def characteristic_coefficients(z: Array) -> Array:
     return characteristic_polynomial(z)[0]
 
 
+def root(x: Array, k: int) -> Array:
+    """The ``k``-th root of ``x``; powers cost more than square roots."""
+    return {1: lambda x: x, 2: jnp.sqrt, 3: jnp.cbrt, 4: lambda x: jnp.sqrt(jnp.sqrt(x))}.get(
+        k, lambda x: x ** (1 / k)
+    )(x)
+
+
 def root_scale(coefficients: Array) -> Array:
     """Lower bound of the largest modulus of the roots: max_k (|a_k| / binomial(n, k))^(1/k), ``(n, ...) -> (...)``."""
-    n = coefficients.shape[0]
-    roots = {1: lambda x: x, 2: jnp.sqrt, 3: jnp.cbrt, 4: lambda x: jnp.sqrt(jnp.sqrt(x))}
-    terms = [jnp.abs(coefficients[k - 1]) / math.comb(n, k) for k in range(1, n + 1)]
-    return reduce(jnp.maximum, (roots.get(k, lambda x, k=k: x ** (1 / k))(x) for k, x in enumerate(terms, 1)))
+    n = len(coefficients)
+    return reduce(jnp.maximum, (root(jnp.abs(coefficients[k - 1]) / math.comb(n, k), k) for k in range(1, n + 1)))
 
 
 def sort_multipliers(real: Array, imaginary: Array) -> Array:
