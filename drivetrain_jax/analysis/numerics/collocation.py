@@ -308,7 +308,7 @@ def small_panel(scheme: Scheme, coefficients: Sequence[Array]) -> Array:
     def eliminated(matrix: Array, k: Array) -> tuple[Array, None]:
         return matrix - matrix[:, k, None] * matrix[k] / matrix[k, k], None
 
-    return jax.lax.scan(eliminated, jnp.concatenate([top, bottom]), np.arange(count))[0][count:, count:]
+    return jax.lax.scan(eliminated, jnp.concatenate([top, bottom]), jnp.arange(count))[0][count:, count:]
 
 
 # Propagators of a linear periodic system along a coordinate x, as power series in x: a line costs as much as a few solves.
