@@ -85,7 +85,8 @@ class Patches:
         """Lower and upper bound of the true function over each patch, ``(N,)`` each."""
         flat = self.coefficients.reshape(math.prod(self.coefficients.shape[:-1]), len(self))
         rest = np.abs(flat[1:]).sum(axis=0) + self.error
-        return flat[0] - rest, flat[0] + rest
+        with np.errstate(invalid="ignore"):
+            return flat[0] - rest, flat[0] + rest
 
     def __call__(self, t: np.ndarray) -> np.ndarray:
         """Values at one position ``t`` in [-1, 1]^d per patch, ``(N, d) -> (N,)``."""

@@ -85,7 +85,12 @@ def test_files_of_another_kind_are_refused(tmp_path, capsys):
     (tmp_path / "t.ods").write_bytes(b"PK")
     (tmp_path / "t.xlsx").write_bytes(b"no workbook")
     (tmp_path / "t.csv").write_bytes(b"length\n\xff\xfe\n")
-    for name, word in (("t.ods", ".csv or .xlsx"), ("t.xlsx", "workbook"), ("t.csv", "UTF-8"), ("no.csv", "No such")):
+    for name, word in (
+        ("t.ods", ".csv, .xlsx or .toml"),
+        ("t.xlsx", "workbook"),
+        ("t.csv", "UTF-8"),
+        ("no.csv", "No such"),
+    ):
         assert main(["point", "bicardan", "critical_speeds", "--data", str(tmp_path / name)]) == 2
         error = capsys.readouterr().err
         assert word in error and error.count("\n") == 1

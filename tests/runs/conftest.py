@@ -15,6 +15,8 @@ def toys(monkeypatch):
     import toy
 
     monkeypatch.setitem(os.environ, "DRIVETRAIN_JAX_CACHE", "0")
+    # A pickled job registers the class of its system.
+    monkeypatch.setattr("drivetrain_jax.systems._REGISTERED", {})
     toy.names(monkeypatch.setattr)
 
 

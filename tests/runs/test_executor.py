@@ -173,7 +173,7 @@ def test_wrong_executor_is_one_clear_line(monkeypatch, options, message):
 def test_a_class_of_a_session_is_refused_before_workers_start(monkeypatch):
     """Workers import the module of a class; that of a notebook has no file."""
     pytest.importorskip("distributed")
-    monkeypatch.setattr(sys.modules["__main__"], "__file__", "<cell>")
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", "<cell>", raising=False)
     own = type("Own", (dt.Rattle,), {"name": "own", "__module__": "__main__"})
     with pytest.raises(InputError, match=r"^system = 'own': workers cannot import a class of this session; expected"):
         make_executor(workers=1).check(own)
