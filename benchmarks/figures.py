@@ -46,10 +46,11 @@ def draw_precision(rungs: pd.DataFrame, facts: Mapping[str, str], path: Path) ->
         ax.set_xlabel("largest relative error")
     figure.supylabel("time per point / s", fontsize=10)
     handles = [Line2D([], [], label=method, **_style(i)) for i, method in enumerate(methods)]
-    hollow = Line2D([], [], ls="none", marker="o", ms=7, mfc="white", mec="black", label="points failed")
+    if (rungs.failed > 0).any() or rungs.error.isna().any():
+        handles.append(Line2D([], [], ls="none", marker="o", ms=7, mfc="white", mec="black", label="points failed"))
     about = "; ".join(facts.get(name, "") for name in ("machine", "versions", "date"))
     figure.legend(
-        handles=[*handles, hollow], loc="outside lower center", ncols=min(5, columns + 2), frameon=False, fontsize=8.5,
+        handles=handles, loc="outside lower center", ncols=min(5, columns + 2), frameon=False, fontsize=8.5,
         title=about, title_fontsize=6.5,
     )  # fmt: skip
     figure.savefig(path)
