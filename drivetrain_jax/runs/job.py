@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 # Most kernels that are compiled in parallel.
 _SIDE_BY_SIDE = 8
 
-Results = Arrays
-
 
 @dataclass(frozen=True)
 class Block:
@@ -157,7 +155,7 @@ class Job:
                 few = self._few and not solver.lengthy
                 self._kernels[index, size] = pool.submit(kernel_of, self.problem, self.grid, solver, size, few)
 
-    def compute(self, chunk: Chunk) -> Results:
+    def compute(self, chunk: Chunk) -> Arrays:
         """Results of one chunk; thread-safe. Raises :class:`ChunkError`."""
         self.prepare([chunk])
         try:
@@ -172,12 +170,12 @@ class Job:
             kind = RetryableError if passes else ChunkError
             raise kind(f"{self.solvers[chunk.solver].name}: {type(error).__name__}: {error}") from error
 
-    def compute_block(self, block: Block) -> Results:
+    def compute_block(self, block: Block) -> Arrays:
         """Results of one block, in this thread."""
         chunks = self.plan(block)
         return self.joined(block, chunks, list(map(self.compute, chunks)))
 
-    def joined(self, block: Block, chunks: Sequence[Chunk], results: Sequence[Results]) -> Results:
+    def joined(self, block: Block, chunks: Sequence[Chunk], results: Sequence[Arrays]) -> Arrays:
         """The results of all ``chunks`` of a block in the order of its points; others have no value."""
         count, joined = len(self.points(block)), {}
         rows = np.concatenate([np.empty(0, np.int64), *(chunk.rows for chunk in chunks)])

@@ -25,14 +25,14 @@ from drivetrain_jax.runs.assemble import (
     stored_blocks,
     with_pending,
 )
-from drivetrain_jax.runs.job import Job, Results
+from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.reuse import NO_REUSE, NotReusable, ReusableResult, ReusedPoints, combined, differences, find
 from drivetrain_jax.runs.scene import load_scene, restore_scene
 from drivetrain_jax.store import checksums, consolidate, zarr_store
 from drivetrain_jax.store.checksums import opened
 from drivetrain_jax.store.files import behind_link
-from drivetrain_jax.store.parts import PartsFolder
+from drivetrain_jax.store.parts import Arrays, PartsFolder
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -216,7 +216,7 @@ class Output:
             )
         return reused
 
-    def finished(self) -> Iterator[tuple[np.ndarray, Results]]:
+    def finished(self) -> Iterator[tuple[np.ndarray, Arrays]]:
         """Yield points and results of unfinished work, reused ones included."""
         if self.unfinished:
             names = self.unfinished.get("reused_files") or ()

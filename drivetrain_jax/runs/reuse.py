@@ -21,10 +21,11 @@ from drivetrain_jax._errors import InputError, clipped, counted
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import misfits, sweep_first
 from drivetrain_jax.runs.axes import Grid, entry_of
-from drivetrain_jax.runs.job import Job, Results, scene_content
+from drivetrain_jax.runs.job import Job, scene_content
 from drivetrain_jax.runs.scene import Scene, is_of_function, restore_scene, result_variables
 from drivetrain_jax.store import checksums, consolidate
 from drivetrain_jax.store.files import digest
+from drivetrain_jax.store.parts import Arrays
 
 # Points that are copied at a time.
 _BLOCK = 1 << 18
@@ -55,7 +56,7 @@ class ReusableResult:
     ours: np.ndarray
     is_covered: bool
 
-    def blocks(self) -> Iterator[tuple[np.ndarray, Results]]:
+    def blocks(self) -> Iterator[tuple[np.ndarray, Arrays]]:
         """Yield our points and their results in blocks, so that no result is loaded as a whole."""
         arrays = {name: sweep_first(consolidate.map_variable(self.path, name), self.grid) for name in self.names}
         for start in range(0, self.ours.size, _BLOCK):

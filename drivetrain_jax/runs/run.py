@@ -126,7 +126,7 @@ def run_to_file(
 
 def _into(output: Output, reused: ReusedPoints, fresh: bool, executor: Threads, report: Report | None) -> Progress:
     """Start or resume the result of ``output``; the points ``reused`` are reused."""
-    job, parts, progress = output.job, output.parts, Progress.of(output.job)
+    job, parts, progress = output.job, output.parts, Progress.before(output.job)
     begins = False
     try:
         parts.open()
@@ -170,7 +170,7 @@ def _job(scene: str | Path | Mapping[str, Any] | Scene, overrides: Mapping[str, 
 
 
 def _in_memory(job: Job, executor: Threads, report: Report | None) -> xr.Dataset:
-    progress = Progress.of(job)
+    progress = Progress.before(job)
     try:
         work = Work(executor, report)
         result = job.route.in_memory(job, work, progress)

@@ -30,15 +30,13 @@ from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.reuse import ReusedPoints
 from drivetrain_jax.runs.scene import Problem, Ranges, Scene
 from drivetrain_jax.runs.work import DIRECT, Progress, Route, Work
-from drivetrain_jax.store.parts import Shards
+from drivetrain_jax.store.parts import Arrays, Shards
 
 # Cells evaluated at a time, which determines memory and the interval of progress reports, and rows of a tile.
 _BLOCK = 1 << 21
 _ROWS = 64
 # Cells above which preparations run in parallel with the solves.
 _LARGE = 1 << 19
-
-Results = Mapping[str, np.ndarray]
 
 
 class ThroughAtlas(Route):
@@ -105,7 +103,7 @@ def evaluate(
     return rest.size
 
 
-def _points(job: Job, atlas: StabilityAtlas, buffer: ResultBuffer) -> Iterator[tuple[tuple[slice], Results]]:
+def _points(job: Job, atlas: StabilityAtlas, buffer: ResultBuffer) -> Iterator[tuple[tuple[slice], Arrays]]:
     """Yield positions among the points, and the filled arrays of ``buffer`` there."""
     names, outputs = atlas.atlas.parameters, job.scene.request.outputs
     for start in range(0, job.grid.size, _BLOCK):
@@ -119,7 +117,7 @@ def _points(job: Job, atlas: StabilityAtlas, buffer: ResultBuffer) -> Iterator[t
         yield place, arrays
 
 
-def _blocks(job: Job, atlas: StabilityAtlas, buffer: ResultBuffer) -> Iterator[tuple[tuple[slice, ...], Results]]:
+def _blocks(job: Job, atlas: StabilityAtlas, buffer: ResultBuffer) -> Iterator[tuple[tuple[slice, ...], Arrays]]:
     """Yield positions in the grid block by block, and the filled arrays of ``buffer`` there."""
     axes = {axis.name: axis.values for axis in job.grid.axes}
     atlas = atlas.slice({name: float(axes[name][0]) for name in _single(axes, atlas.atlas.parameters)})

@@ -25,9 +25,10 @@ from drivetrain_jax._machine import threads, usable_cores
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.assemble import BlockStore, ResultBuffer, labelled, stored_blocks
-from drivetrain_jax.runs.job import Block, Chunk, Job, Results
+from drivetrain_jax.runs.job import Block, Chunk, Job
 from drivetrain_jax.runs.reuse import NO_REUSE, ReusedPoints
 from drivetrain_jax.store.consolidate import Labelled, ResultFile
+from drivetrain_jax.store.parts import Arrays
 from drivetrain_jax.systems import System
 
 # Tasks per worker: one is computed while the other waits, so no worker idles during writing.
@@ -44,9 +45,9 @@ _LOCAL = re.compile(r"local:([1-9]\d*)")
 _TALKATIVE = ("distributed", "tornado", "asyncio")
 
 # Blocks and their results in the order of completion.
-Finished = Generator[tuple[Block, Results | None], None, None]
+Finished = Generator[tuple[Block, Arrays | None], None, None]
 # A block in work, its chunks, the results of those that are computed, and the position of the chunk to compute.
-Task = tuple[Block, tuple[Chunk, ...], dict[int, Results], int]
+Task = tuple[Block, tuple[Chunk, ...], dict[int, Arrays], int]
 
 
 @dataclass
@@ -68,7 +69,7 @@ class Progress:
     note: str = ""
 
     @classmethod
-    def of(cls, job: Job) -> Progress:
+    def before(cls, job: Job) -> Progress:
         """The counts before a run; those of an atlas are solves, which are not points of a grid."""
         return cls(0, kind="direct solves") if job.scene.analysis.continuous else cls(job.total)
 
@@ -116,11 +117,11 @@ class Threads:
             for block in blocks:
                 chunks = job.plan(block)
                 job.prepare(chunks)
-                results: dict[int, Results] = {}
+                results: dict[int, Arrays] = {}
                 # A block without chunks still has a task, because its results must be written.
                 yield from ((block, chunks, results, position) for position in range(max(len(chunks), 1)))
 
-        def compute(task: Task) -> Results:
+        def compute(task: Task) -> Arrays:
             _, chunks, _, position = task
             return job.compute(chunks[position]) if chunks else {}
 
@@ -140,8 +141,8 @@ class Threads:
 
 
 def run_threads(
-    tasks: Iterable[Any], work: Callable[[Any], Results], count: int
-) -> Generator[tuple[Any, Results], None, None]:
+    tasks: Iterable[Any], work: Callable[[Any], Arrays], count: int
+) -> Generator[tuple[Any, Arrays], None, None]:
     """Yield results from ``count`` threads of this process; compiled code releases the interpreter's lock.
 
     An exception of a task is raised here. After the iterator is closed (also by an interrupt) no further task starts;
@@ -149,8 +150,8 @@ def run_threads(
     """
     pool = threads(count, "chunk")
     remaining = iter(tasks)
-    running: dict[Future[Results], Any] = {}
-    finished: SimpleQueue[Future[Results]] = SimpleQueue()
+    running: dict[Future[Arrays], Any] = {}
+    finished: SimpleQueue[Future[Arrays]] = SimpleQueue()
     try:
         while True:
             while len(running) < _CHUNKS_IN_FLIGHT * count and (task := next(remaining, None)) is not None:
@@ -175,7 +176,7 @@ def _first(job: Job) -> Job:
     return job
 
 
-def compute(job: Job, store: BlockStore | None, digest: str, block: Block, number: int) -> Results:
+def compute(job: Job, store: BlockStore | None, digest: str, block: Block, number: int) -> Arrays:
     """Compute ``block`` in a worker. The results return to the driver without a store, otherwise the outcomes alone.
 
     ``digest`` is that of the job in the driver.
@@ -272,7 +273,7 @@ class Cluster(Threads):
         self._connection.close()
 
 
-def _result(distributed: Any, future: Any) -> Results | None:
+def _result(distributed: Any, future: Any) -> Arrays | None:
     try:
         return future.result()
     except distributed.KilledWorker:
@@ -339,7 +340,7 @@ def make_executor(threads: int | None = None, workers: int | None = None, dask: 
 class Receiver(Protocol):
     """Receives results: the buffer of a scene, or a collector of solves."""
 
-    def fill(self, points: np.ndarray, results: Results) -> None:
+    def fill(self, points: np.ndarray, results: Arrays) -> None:
         """Write the results of ``points``."""
 
 
@@ -367,7 +368,7 @@ class Work:
         """
         done, length, left = set[int](), job.grid.path_length, job.grid.size if points is None else len(points)
 
-        def stored() -> Iterator[tuple[Block, Results]]:
+        def stored() -> Iterator[tuple[Block, Arrays]]:
             if self.store is not None:
                 yield from stored_blocks(self.store, job, points, first, done)
 
@@ -408,8 +409,8 @@ class Work:
             raise
 
     def _received(
-        self, job: Job, block: Block, results: Results | None, first: int, receiver: Receiver | None
-    ) -> Results:
+        self, job: Job, block: Block, results: Arrays | None, first: int, receiver: Receiver | None
+    ) -> Arrays:
         """The results of a computed block, handed to ``receiver``; those of a lost one have no values."""
         if results is None:
             results = job.joined(block, (), ())

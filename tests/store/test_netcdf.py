@@ -116,11 +116,16 @@ def test_lengths_that_disagree_are_refused():
         _ = labelled.sizes
 
 
-def test_a_finished_file_stays_finished_on_a_failing_disk(tmp_path, monkeypatch):
+def test_a_finished_file_stays_finished_on_a_failing_disk(result, tmp_path, monkeypatch):
     """An export whose file was in place ended with an error, and could not be repeated."""
 
     def unlink(*_, **__):
         raise OSError(errno.EIO, "Input/output error")
 
-    with ResultFile(tmp_path / "r.tmp"):
+    with ResultFile(tmp_path / "r.tmp") as file:
+        for name, array in file.lay_out(result).items():
+            array[...] = result.data[name].values
+        file.finish(tmp_path / "r.nc")
         monkeypatch.setattr(Path, "unlink", unlink)
+    with xr.open_dataset(tmp_path / "r.nc", engine="h5netcdf") as again:
+        assert again.attrs["digest"] == "abc"

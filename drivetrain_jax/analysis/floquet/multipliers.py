@@ -101,7 +101,7 @@ class PolynomialError(NamedTuple):
     sizes: Array
     centre: Array | float = 0.0
 
-    def at(self, distance: Array) -> Array:
+    def bound(self, distance: Array) -> Array:
         """The bound at a ``distance`` from the centre, which has the axes of the lanes last."""
         return reduce(lambda total, size: total * distance + size, self.sizes, jnp.zeros_like(distance))
 
@@ -139,7 +139,7 @@ def multiplier_errors(real: Array, imaginary: Array, error: PolynomialError, cou
         r, radii = state
         # The distance of a multiplier from itself is 0, so each product has the factor r.
         product = over_first(jnp.multiply, jnp.where(counted, jnp.abs(distances - r), 1.0))
-        return r * _STEP, jnp.where(product > scaled.at(reach + r), r, radii)
+        return r * _STEP, jnp.where(product > scaled.bound(reach + r), r, radii)
 
     start = jnp.asarray(_LARGEST), jnp.full_like(real, jnp.inf)
     return rho * (jax.lax.fori_loop(0, _COUNT, descend, start)[1] + 4 * np.finfo(float).eps)

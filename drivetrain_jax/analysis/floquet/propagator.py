@@ -273,16 +273,21 @@ def _of_one(compute: Callable[..., Any], system: LinearPeriodic, shared: tuple[A
 
 
 def _in_factors(fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array]) -> Factored:
-    return _by_blocks(_factors_of_block, fixed, arrays, shared)
+    return _by_blocks(_factors_of_block, fixed, arrays, shared, _FEW)
 
 
 def _refined(fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array, Array, Array]) -> tuple[Array, Monodromy]:
     """The propagator and the monodromy matrix of all lanes, the last axis of ``arrays``."""
-    return _by_blocks(_agreeing, fixed, arrays, shared)
+    return _by_blocks(_agreeing, fixed, arrays, shared, _LONG)
 
 
-def _by_blocks(compute: Callable[..., Any], fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array, ...]) -> Any:
-    """``compute(marches, fixed values, ends, determinant, lanes, *shared)`` of all lanes, in one kernel if possible."""
+def _by_blocks(
+    compute: Callable[..., Any], fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array, ...], longest: int
+) -> Any:
+    """``compute(marches, fixed values, ends, determinant, lanes, *shared)`` of all lanes, in one kernel if possible.
+
+    ``longest``: most states of a chain for which ``compute`` compiles as one kernel.
+    """
     lanes = max((x.shape[-1] for x in jax.tree.leaves(arrays) if x.ndim), default=1)
     size = LANES if lanes > LANES and on_cpu() else lanes
     blocks = jax.tree.map(lambda x: blocks_first(x, size) if x.ndim and x.shape[-1] == lanes else x, arrays)
@@ -308,8 +313,7 @@ def _by_blocks(compute: Callable[..., Any], fixed: Constants, arrays: LinearPeri
 
         return jax.lax.map(block, packed)
 
-    most = [_LONG if march.chain and compute is _agreeing else _FEW for march in marches]
-    small = [march.size <= n and march.d <= _SMALL for n, march in zip(most, marches, strict=True)]
+    small = [march.d <= _SMALL and march.size <= (longest if march.chain else _FEW) for march in marches]
     in_one = all(small) and all(march.suits for march in marches)
     mark = in_one_kernel if in_one else lambda function: function
     return jax.tree.map(lambda x: blocks_joined(x, lanes), mark(all_blocks)(shared, packed))
@@ -502,8 +506,8 @@ class Panels:
         self.moving = split.moving
         # Only neighbours are coupled, as in a chain of more than two.
         places = jax.eval_shape(lambda *at: system.entries(*at), *jax.eval_shape(system.basis, times))
-        own = [(i - self.d, j % self.d) for i, j in places if i >= self.d]
-        self.chain = unit is not None and self.d > 2 and all(abs(i - j) < 2 for i, j in own)
+        couplings = [(i - self.d, j % self.d) for i, j in places if i >= self.d]
+        self.chain = unit is not None and self.d > 2 and all(abs(i - j) < 2 for i, j in couplings)
         self.suits = suits_one_kernel(lambda t: system.rows(*system.basis(t)), times)
         self.fixed = Fixed(split.fixed, jnp.asarray(system.span, float), jnp.asarray(1.0 if unit is None else unit))
 

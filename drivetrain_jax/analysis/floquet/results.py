@@ -89,9 +89,9 @@ def radius_in_closed_form(
         certain = state[-1]
         chosen = jnp.nonzero(~certain, size=min(lanes, _REPAIRED), fill_value=jnp.argmin(certain))[0]
         spectrum = eigenvalues(z[..., chosen])
-        own = error.lanes(chosen)
-        on_circle = all_on_the_circle(*spectrum, own, scale[chosen])
-        replaced = *radius_by_eigenvalues(spectrum, own), undamped[chosen] & on_circle, True
+        chosen_error = error.lanes(chosen)
+        on_circle = all_on_the_circle(*spectrum, chosen_error, scale[chosen])
+        replaced = *radius_by_eigenvalues(spectrum, chosen_error), undamped[chosen] & on_circle, True
         return tuple(x.at[chosen].set(new) for x, new in zip(state, replaced, strict=True))
 
     rho, bound, certain = in_blocks(closed, (z, error, scale, undamped), lanes, _BLOCK, in_one_kernel)
@@ -114,7 +114,7 @@ def _coefficients(z: Array) -> tuple[quartic.Coefficients, Array]:
 def _errors(error: PolynomialError, farthest: Array, norm: Array, moved: Array) -> tuple[Array, ...]:
     # The recursion for a_k multiplies k matrices.
     errors = [_ROUNDINGS * quartic.EPS * norm**k for k in (1, 2, 3, 4)]
-    return *errors[:3], errors[3] + moved + error.at(farthest)
+    return *errors[:3], errors[3] + moved + error.bound(farthest)
 
 
 VARIABLES = (

@@ -220,7 +220,7 @@ def _shifts(h: Array, last: Array, count: Array) -> tuple[Array, Array]:
 
 
 def _start(k: int, h: Array, first: Array, last: Array, total: Array, product: Array) -> Array:
-    """What the reflection number ``k`` of a sweep turns, ``(r, ...)``: in the first row of the block the shifts."""
+    """The column that reflection ``k`` of a sweep turns, ``(r, ...)``; in the first row of the block it has the shifts."""
     bulge = h[k : k + 3, k - 1] if k else jnp.zeros_like(h[:3, 0])
     a, b, c = h[k, k], h[k + 1, k + 1], h[k + 1, k]
     begins, goes = k == first, (k >= first) & (k < last)
