@@ -22,11 +22,10 @@ import xarray as xr
 import drivetrain_jax
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.cli import progress_line
 from drivetrain_jax.datasets.figure import table
 from drivetrain_jax.runs.atlas_chart import chart
 from drivetrain_jax.runs.output import status
-from drivetrain_jax.runs.run import Incomplete, run_to_file
+from drivetrain_jax.runs.run import Incomplete, ProgressLine, run_to_file
 from drivetrain_jax.store.consolidate import open_result
 from drivetrain_jax.systems import get_system, system_names
 
@@ -86,7 +85,7 @@ def items(folder: Path) -> list[Item]:
 def compute(scene: Path, folder: Path) -> Path:
     """Compute or resume a scene and return the path of its result; a stale result is replaced."""
     out = folder / f"{scene.stem}.nc"
-    with progress_line() as show:
+    with ProgressLine() as show:
         run_to_file(scene, out, fresh=status(scene, out).state == "stale", report=show)
     return out
 

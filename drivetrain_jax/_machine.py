@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import shutil
 import sys
 import threading
 import time
@@ -99,23 +100,43 @@ def terminal() -> bool:
     return bool(sys.stderr and sys.stderr.isatty()) and os.environ.get("TERM") != "dumb"
 
 
+class StatusLine:
+    """The last line of a terminal, or a cell of a notebook, whose text is replaced; a pipe gets nothing."""
+
+    _shown: Any = None
+
+    def write(self, text: str, part: float | None = None) -> None:
+        """Replace the text; ``part`` adds a bar of this part of its length."""
+        if not text and not self._shown:
+            return
+        if shell := notebook():
+            bar = "" if part is None else f'<progress value="{part:.4f}" max="1"></progress> '
+            if self._shown:
+                self._shown.update(shell.HTML(bar + text))
+            else:
+                self._shown = shell.display(shell.HTML(bar + text), display_id=True)
+        elif terminal():
+            bar = "" if part is None else f"[{'#' * round(20 * part):-<20}] "
+            line = (bar + text)[: shutil.get_terminal_size().columns - 1]
+            print(f"\r{line}\x1b[K", end="", file=sys.stderr, flush=True)
+            self._shown = text
+
+
 class CompilingLine:
     """Context in which a terminal or a notebook says that this process compiles, and for how long, after ``patience`` [s].
 
-    Contexts of several threads share the line, which the end of the last one removes. A pipe gets nothing, nor does a
-    terminal while the line is ``hidden``, as beside the progress bar of a command.
+    Contexts of several threads share the line, which the end of the last one removes.
     """
 
     def __init__(self, patience: float = 2.0) -> None:
-        self.hidden, self.patience = False, patience
+        self.patience, self._line = patience, StatusLine()
         self._lock, self._users, self._begin = threading.Lock(), 0, 0.0
         self._timer: threading.Timer | None = None
-        self._shown: Any = None
 
     def __enter__(self) -> None:
         with self._lock:
             self._users += 1
-            if self._users == 1 and not self.hidden and (terminal() or notebook()):
+            if self._users == 1 and (terminal() or notebook()):
                 self._begin = time.monotonic()
                 self._show_after(self.patience)
 
@@ -125,8 +146,8 @@ class CompilingLine:
             if self._users == 0 and self._timer is not None:
                 self._timer.cancel()
                 self._timer = None
-                if self._shown:
-                    self._shown = self._write("") and None
+                self._line.write("")
+                self._line = StatusLine()
 
     def _show_after(self, seconds: float) -> None:
         self._timer = threading.Timer(seconds, self._show)
@@ -137,18 +158,8 @@ class CompilingLine:
         with self._lock:
             # None if the compilation has just ended.
             if self._timer is not None:
-                self._shown = self._write(f"compiling, {time.monotonic() - self._begin:.0f} s")
+                self._line.write(f"compiling, {time.monotonic() - self._begin:.0f} s")
                 self._show_after(1.0)
-
-    def _write(self, text: str) -> Any:
-        """Replace the line by ``text``; returns what shows it."""
-        if not (shell := notebook()):
-            print(f"\r{text}\x1b[K", end="", file=sys.stderr, flush=True)
-        elif not self._shown:
-            return shell.display(shell.HTML(text), display_id=True)
-        else:
-            self._shown.update(shell.HTML(text))
-        return self._shown or True
 
 
 compiling = CompilingLine()

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from drivetrain_jax import __version__, _units
 from drivetrain_jax._errors import ChunkError, InputError
-from drivetrain_jax._machine import compiling, terminal
+from drivetrain_jax._machine import StatusLine
 
 if TYPE_CHECKING:
     from drivetrain_jax.runs.run import Progress
@@ -338,11 +338,11 @@ def run(options: argparse.Namespace) -> int:
 def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[Any, int, str]:
     """Counts, exit code, and the message for the user: a note, and the values that miss the tolerance."""
     from drivetrain_jax.runs.output import missed
-    from drivetrain_jax.runs.run import Incomplete, run_to_file
+    from drivetrain_jax.runs.run import Incomplete, ProgressLine, run_to_file
     from drivetrain_jax.runs.work import make_executor
 
     overrides = _overrides(options)
-    with nullcontext() if options.quiet else progress_line() as show:
+    with nullcontext() if options.quiet else ProgressLine() as show:
 
         def report(progress: Progress) -> None:
             check()
@@ -576,52 +576,15 @@ def bench(options: argparse.Namespace) -> int:
     return subprocess.run([sys.executable, "-m", "benchmarks", *words], cwd=checkout, check=False).returncode
 
 
-# Progress on standard error.
-
-
-@contextmanager
-def progress_line() -> Iterator[Callable[[Progress], None]]:
-    """Show a progress bar; yields the function that updates it. Its length is the predicted cost of the finished points."""
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
-
-    columns = BarColumn(), TextColumn("{task.fields[counts]}"), TimeElapsedColumn(), TextColumn("left")
-    bar = Bar(*columns, TimeRemainingColumn(), console=Console(stderr=True))
-    task = bar.add_task("", total=None, counts="compiling")
-    begin, compiling.hidden = time.monotonic(), True
-
-    def report(progress: Progress) -> None:
-        # Started at the first report, because wrong input must print a single line.
-        bar.start()
-        done = progress.computed + progress.reused
-        rate = progress.computed / max(time.monotonic() - begin, 1e-9)
-        counts = f"{done}/{progress.total} {progress.kind}, {rate:.3g}/s" if progress.cost or done else "compiling"
-        bar.update(task, total=progress.total_cost, completed=progress.cost, counts=counts + progress.exceptions)
-
-    try:
-        yield report
-    except InputError:
-        # Remove the bar if the run fails on wrong input, such as a scheduler that does not answer.
-        bar.live.transient = True
-        bar.live.stop()
-        raise
-    finally:
-        compiling.hidden = False
-        if bar.live.is_started:
-            bar.stop()
-
-
 @contextmanager
 def _reading(first: Path, *more: Path) -> Iterator[None]:
     """Show on a terminal that the command works on these files, and remove the line at the end."""
-    write = partial(print, end="", file=sys.stderr, flush=True) if terminal() else lambda _: None
-    write(f"{first.name}{f' and {len(more)} more' if more else ''} ...\r")
+    line = StatusLine()
+    line.write(f"{first.name}{f' and {len(more)} more' if more else ''} ...")
     try:
         yield
     finally:
-        # Clear the line.
-        write("\x1b[K")
+        line.write("")
 
 
 if __name__ == "__main__":

@@ -1,15 +1,16 @@
-"""Run a scene in memory, or into a file that survives interruptions and is resumed; a notebook shows a bar."""
+"""Run a scene in memory, or into a file that survives interruptions and is resumed; and show its progress."""
 
 from __future__ import annotations
 
+import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
-from drivetrain_jax._machine import notebook, physical_memory
+from drivetrain_jax._machine import StatusLine, notebook, physical_memory, terminal
 from drivetrain_jax.runs.assemble import ZarrBlocks
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.output import HDF5, ZARR, Output
@@ -79,7 +80,7 @@ def run(
     executor = make_executor(threads, workers, dask)
     if out is None and reuse:
         raise InputError("reuse: given without out; expected a run into a file")
-    with shown_progress(report) as show:
+    with ProgressLine() if report is None and notebook() else nullcontext(report) as show:
         if out is None:
             return _in_memory(_job(scene, overrides, on_disk=False), executor, show)
         how: dict[str, Any] = {"fresh": fresh, "executor": executor, "reuse": reuse, "report": show}
@@ -181,47 +182,44 @@ def _in_memory(job: Job, executor: Threads, report: Report | None) -> xr.Dataset
         executor.close()
 
 
-# Seconds before a bar appears, and between its updates.
+# Seconds before a line appears, and between its updates.
 _PATIENCE, _STEP = 0.5, 0.2
 
 
-@contextmanager
-def shown_progress(report: Report | None) -> Iterator[Report | None]:
-    """Yield ``report``; if it is None in a notebook, yield a report that shows a bar in the running cell."""
-    if report is not None or notebook() is None:
-        yield report
-        return
-    bar = _Bar()
-    try:
-        yield bar
-    finally:
-        if bar.display:
-            bar.show()
+class ProgressLine:
+    """Context with a report that shows a bar, points done, rate and time; a pipe gets the last state alone.
 
-
-class _Bar:
-    """A bar with points done, rate and time; a run of less than ``_PATIENCE`` shows none."""
+    A notebook shows no run of less than ``_PATIENCE``. Wrong input removes the line.
+    """
 
     def __init__(self) -> None:
-        self._begin, self.display, self._last = time.monotonic(), None, Progress(0)
-        self._due = self._begin + _PATIENCE
+        self._begin, self._line, self._shown = time.monotonic(), StatusLine(), False
+        self._due, self._last = self._begin + _PATIENCE, None
 
-    def __call__(self, progress: Progress) -> None:
+    def __enter__(self) -> Report:
+        return self._report
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None and issubclass(kind, InputError):
+            self._line.write("")
+        elif self._last and (self._shown or not notebook()):
+            text = self._show(self._last)
+            if not notebook():
+                print("" if terminal() else text, file=sys.stderr)
+
+    def _report(self, progress: Progress) -> None:
         self._last = progress
         if time.monotonic() >= self._due:
-            self.show()
+            self._show(progress)
 
-    def show(self) -> None:
-        """Show the last state."""
-        shell = notebook()
-        progress, now = self._last, time.monotonic()
-        self._due, done = now + _STEP, progress.computed + progress.reused
+    def _show(self, progress: Progress) -> str:
+        now = time.monotonic()
+        seconds, done = max(now - self._begin, 1e-9), progress.computed + progress.reused
         # The cost grows evenly in time; points are counted if it is unknown.
         part = progress.cost / progress.total_cost if progress.total_cost else done / max(progress.total, 1)
-        rate, seconds = progress.computed / max(now - self._begin, 1e-9), now - self._begin
-        text = f"{done}/{progress.total} {progress.kind}, {rate:.3g}/s, {seconds:.0f} s{progress.exceptions}"
-        content = shell.HTML(f'<progress value="{part:.4f}" max="1"></progress> {text}')
-        if self.display:
-            self.display.update(content)
-        else:
-            self.display = shell.display(content, display_id=True)
+        left = f", {seconds / part - seconds:.0f} s left" if 0 < part < 1 else ""
+        rate = f"{progress.computed / seconds:.3g}/s, {seconds:.0f} s{left}{progress.exceptions}"
+        text = f"{done}/{progress.total} {progress.kind}, {rate}"
+        self._line.write(text, part)
+        self._due, self._shown = now + _STEP, True
+        return text

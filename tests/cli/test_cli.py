@@ -16,8 +16,8 @@ import pytest
 import xarray as xr
 
 from drivetrain_jax import ChunkError, InputError, __version__
-from drivetrain_jax.cli import _reading, main, progress_line, quiet_hdf5
-from drivetrain_jax.runs.work import Progress
+from drivetrain_jax.cli import _reading, main, quiet_hdf5
+from drivetrain_jax.runs.run import Progress, ProgressLine
 from drivetrain_jax.systems import get_system
 from tests.sizes import full_after
 
@@ -121,14 +121,14 @@ def test_what_counts_do_not_tell_is_a_line_before_them(cli, monkeypatch):
 
 def test_points_that_cost_nothing_are_counted(capsys):
     """The points of an atlas have no cost in the plan."""
-    with progress_line() as report:
+    with ProgressLine() as report:
         report(Progress(total=21, computed=21))
     assert "21/21 points" in capsys.readouterr().err
 
 
 def test_no_bar_beside_the_line_of_wrong_input(capsys):
     """A scheduler that does not answer is found out after the first report."""
-    with pytest.raises(InputError), progress_line() as report:
+    with pytest.raises(InputError), ProgressLine() as report:
         report(Progress(total=21))
         raise InputError("dask = 'tcp://nowhere:1': no scheduler answers there")
     assert capsys.readouterr().err == ""
@@ -623,7 +623,7 @@ def test_help_is_light():
     )
     loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
     assert "drivetrain_jax.cli" in loaded
-    assert not {"jax", "numpy", "scipy", "xarray", "h5py", "matplotlib", "rich", "msgspec"} & set(loaded)
+    assert not {"jax", "numpy", "scipy", "xarray", "h5py", "matplotlib", "msgspec"} & set(loaded)
 
 
 def test_a_call_from_python_leaves_its_garbage_collector_alone(cli):
@@ -642,7 +642,7 @@ def test_looking_at_a_result_loads_no_integrator_and_no_tables(folder):
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert "drivetrain_jax.systems.cardan" in done.stdout
-    assert not {"xarray", "pandas", "scipy.integrate", "diffrax", "matplotlib", "rich"} & set(done.stdout.split())
+    assert not {"xarray", "pandas", "scipy.integrate", "diffrax", "matplotlib"} & set(done.stdout.split())
 
 
 @pytest.mark.full

@@ -72,18 +72,14 @@ def test_a_notebook_says_that_it_compiles(shown):
     assert shown == ["compiling, 0 s", ""]
 
 
-@pytest.mark.parametrize(
-    ("terminal", "hidden", "text"),
-    [(True, False, "\rcompiling, 0 s\x1b[K\r\x1b[K"), (True, True, ""), (False, False, "")],
-)
-def test_a_terminal_says_that_it_compiles_and_a_pipe_does_not(terminal, hidden, text, monkeypatch):
+@pytest.mark.parametrize(("terminal", "text"), [(True, "\rcompiling, 0 s\x1b[K\r\x1b[K"), (False, "")])
+def test_a_terminal_says_that_it_compiles_and_a_pipe_does_not(terminal, text, monkeypatch):
     written = io.StringIO()
     written.isatty = lambda: terminal
     monkeypatch.setattr(sys, "stderr", written)
     monkeypatch.setenv("TERM", "xterm")
     line = CompilingLine(0.02)
     compile_slowly(line, 0.0)
-    line.hidden = hidden
     compile_slowly(line)
     assert written.getvalue() == text
 
