@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import platform
 import shutil
+import signal
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
@@ -163,3 +166,41 @@ class CompilingLine:
 
 
 compiling = CompilingLine()
+
+
+# Time [s] after a signal during which further signals are ignored.
+_GRACE = 2.0
+
+
+@contextmanager
+def stop_on_signals(*numbers: signal.Signals) -> Iterator[Callable[[], None]]:
+    """Raise ``KeyboardInterrupt`` on the signals ``numbers`` inside the context.
+
+    Yields a function that raises it again after a signal, because a destructor or a C callback may swallow the first one;
+    nothing is printed then. Further signals are ignored for two seconds, so that finished chunks are written.
+    """
+    caught: list[float] = []
+    report_unraisable = sys.unraisablehook
+
+    def check() -> None:
+        if caught:
+            raise KeyboardInterrupt
+
+    def stop(*_: object) -> None:
+        caught.append(time.monotonic())
+        if len(caught) == 1 or caught[-1] - caught[0] > _GRACE:
+            raise KeyboardInterrupt
+
+    def report(swallowed: Any) -> None:
+        if swallowed.exc_type is not KeyboardInterrupt:
+            report_unraisable(swallowed)
+
+    handlers = {number: signal.signal(number, stop) for number in numbers}
+    sys.unraisablehook = report
+    try:
+        yield check
+    finally:
+        sys.unraisablehook = report_unraisable
+        for number, handler in handlers.items():
+            # A handler that Python did not set cannot be restored.
+            signal.signal(number, handler or signal.SIG_DFL)

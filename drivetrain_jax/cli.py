@@ -13,7 +13,6 @@ import os
 import re
 import signal
 import sys
-import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -24,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from drivetrain_jax import __version__, _units
 from drivetrain_jax._errors import ChunkError, InputError
-from drivetrain_jax._machine import StatusLine
+from drivetrain_jax._machine import StatusLine, stop_on_signals
 
 if TYPE_CHECKING:
     from drivetrain_jax.runs.run import Progress
@@ -38,8 +37,6 @@ _FIGURES = (".png", ".pdf", ".svg")
 # Tables of constants, and their separators.
 _TABLES = {".txt": "", ".csv": ","}
 _PAGES = (".html", ".htm")
-# Time [s] after a signal during which further signals are ignored.
-_GRACE = 2.0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -318,7 +315,7 @@ def _answer(reply: Any, options: argparse.Namespace) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Compute or resume a scene. Ctrl-C and SIGTERM stop it; finished blocks are kept."""
-    with _stop_on_signals() as check:
+    with stop_on_signals(signal.SIGINT, signal.SIGTERM) as check:
         try:
             progress, code, reason = _compute(options, check)
         except KeyboardInterrupt as stop:
@@ -366,40 +363,6 @@ def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[An
         return progress, OK, ""
     lost = missed(options.out, progress.inaccurate, progress.total) if progress.inaccurate else ""
     return progress, OK, "; ".join(filter(None, (progress.note, lost)))
-
-
-@contextmanager
-def _stop_on_signals() -> Iterator[Callable[[], None]]:
-    """Raise ``KeyboardInterrupt`` on Ctrl-C and SIGTERM inside the context.
-
-    Yields a function that raises it again after a signal, because a destructor or a C callback may swallow the first one;
-    nothing is printed then. Further signals are ignored for two seconds, so that finished chunks are written.
-    """
-    caught: list[float] = []
-    report_unraisable = sys.unraisablehook
-
-    def check() -> None:
-        if caught:
-            raise KeyboardInterrupt
-
-    def stop(*_: object) -> None:
-        caught.append(time.monotonic())
-        if len(caught) == 1 or caught[-1] - caught[0] > _GRACE:
-            raise KeyboardInterrupt
-
-    def report(swallowed: Any) -> None:
-        if swallowed.exc_type is not KeyboardInterrupt:
-            report_unraisable(swallowed)
-
-    handlers = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    sys.unraisablehook = report
-    try:
-        yield check
-    finally:
-        sys.unraisablehook = report_unraisable
-        for number, handler in handlers.items():
-            # A handler that Python did not set cannot be restored.
-            signal.signal(number, handler or signal.SIG_DFL)
 
 
 def _overrides(options: argparse.Namespace) -> dict[str, Any]:

@@ -213,10 +213,17 @@ def in_hertz(values: Any, units: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Orders:
-    """Excitations by name, each with its periods ``per_turn`` of the ``shaft``."""
+    """Excitations by name, each with its periods ``per_turn`` of the ``shaft``; ``still``: discs of that shaft have a
+    gyroscopic effect, which natural frequencies at rest lack."""
 
     shaft: str
     per_turn: Mapping[str, float]
+    still: bool = False
+
+    @property
+    def frequency(self) -> str:
+        """The frequencies that the orders meet, as a label."""
+        return "natural frequency at rest, without gyroscopic effect" if self.still else "natural frequency"
 
     def speeds(self, frequency: Any) -> np.ndarray:
         """Speeds [rpm] at which the orders meet each ``frequency`` [Hz], shape ``(..., orders)``; NaN at rigid motions.
@@ -247,7 +254,8 @@ def orders_of(system: str, values: Mapping[str, Any]) -> Orders | None:
     """The orders that excite ``system``, from its parameters and physical data ``values``; None if they are not known."""
     if system == "bicardan":
         # A joint under an angle and a torque bends the shaft twice a turn.
-        return Orders("shaft", {"order 1": 1.0, "order 2 (joints)": 2.0})
+        discs = any(np.any(values.get(name) or 0.0) for name in ("Ip_A", "Ip_D", "Ip_joint"))
+        return Orders("shaft", {"order 1": 1.0, "order 2 (joints)": 2.0}, still=discs)
     if system == "driveline":
         # A joint is excited twice a turn of its input, and less by multiples of it.
         count, ratio = len(values.get("k", ())), values.get("ratio") or ()

@@ -206,15 +206,16 @@ def _about_orders(dataset: xr.Dataset) -> Iterator[str]:
     factor, unit = suitable("rpm", json.loads(dataset.attrs.get(ASKED, "[]")))
     speeds = orders.speeds(value_in(dataset[name], "Hz").reshape(-1)) * factor
     operating = operating_range(json.loads(dataset.attrs.get("options", "{}")))
+    rest = f" ({orders.frequency})" if orders.still else ""
     if operating:
         low, high = (end * factor for end in operating)
         for sentence in orders.within(speeds, low, high, unit):
-            yield f"From {low:g} to {high:g} {unit} of the {orders.shaft}: {sentence}."
+            yield f"From {low:g} to {high:g} {unit} of the {orders.shaft}{rest}: {sentence}."
         return
     for order, column in zip(orders.per_turn, speeds.T, strict=True):
         met = [f"{speed:.6g}" for speed in column[np.isfinite(column)]]
         more = f" and {len(met) - MOST_RANGES} more speeds" if len(met) > MOST_RANGES else ""
-        yield f"{_capital(order)} meets modes at {', '.join(met[:MOST_RANGES])}{more} {unit} of the {orders.shaft}."
+        yield f"{_capital(order)} meets modes at {', '.join(met[:MOST_RANGES])}{more} {unit} of the {orders.shaft}{rest}."
 
 
 def _place(dataset: xr.Dataset, variable: xr.DataArray, place: tuple[Any, ...]) -> str:

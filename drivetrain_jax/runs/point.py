@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Iterator, KeysView, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -317,7 +318,7 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
     if "verdict" in values and outcome.has_value:
         word = scene.analysis.variable("verdict").flags[int(values["verdict"])]
         sentence = f"{'; '.join(verdict_words(word, grows, scene.analysis.name == 'floquet'))}."
-    orders = order_crossings(scene, ordered, values)
+    orders = order_crossings(scene, ordered, values) if outcome.has_value else None
     return PointResult(
         system=scene.system.name,
         analysis=scene.analysis.name,
@@ -333,7 +334,7 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
         advice=scene.analysis.advice(scene.request),
         growth=grows,
         orders=orders,
-        sentence=sentence or (orders.sentence(values) if orders else ""),
+        sentence=sentence or (orders.sentence(values, float(ordered.get("speed", 0.0))) if orders else ""),
     )
 
 
@@ -355,17 +356,19 @@ def _labels(job: Job, values: Mapping[str, Any], buffer: ResultBuffer) -> dict[s
 
 # Digits of given values in an answer.
 _PROSE = 6
-# Most modes in the sentence about an order.
-_FIRST = 6
+# Most modes in the sentence about an order, and speeds of one kind in that about whirl.
+_FIRST, _FEW = 6, 3
 
 
 @dataclass(frozen=True)
 class OrderCrossings:
-    """The ``orders`` with their ``speeds`` (modes, orders) [rpm], and the operating range [rpm] if one is given."""
+    """The ``orders`` with their ``speeds`` (modes, orders) [rpm], the operating range [rpm] if one is given, and whether
+    the speeds include the gyroscopic effect."""
 
     orders: Orders
     speeds: np.ndarray
     operating: tuple[float, float] | None
+    turning: bool = False
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
@@ -378,10 +381,23 @@ class OrderCrossings:
         modes = [
             [str(k), *(f"{x:.6g}" if np.isfinite(x) else "-" for x in row)] for k, row in enumerate(self.speeds, 1)
         ]
-        return [f"  speed of the {self.orders.shaft} at which an order meets the mode", *aligned([head, *modes])]
+        how = ", with the gyroscopic effect" if self.turning else ""
+        return [f"  speed of the {self.orders.shaft} at which an order meets the mode{how}", *aligned([head, *modes])]
 
-    def sentence(self, values: Mapping[str, Any]) -> str:
-        """The speeds within the operating range, else the first ones; and the modes of ``values`` too near to that range."""
+    def sentence(self, values: Mapping[str, Any], speed: float) -> str:
+        """Whirl at the ``speed`` [rad/s] and critical speeds; else of ``values`` the speeds within the operating range or
+        the first ones, and the modes too near to that range."""
+        if "whirl_frequency" in values:
+            codes, turns = values.get("whirl_direction"), values["whirl_frequency"] * 60 / (2 * math.pi)
+            senses = (
+                {} if codes is None else {"backward at": codes == 0, "forward at": codes == 2, "planar at": codes == 1}
+            )
+            said = [f"{sense} {_first(turns[which])}" for sense, which in senses.items() if np.any(which)]
+            critical = [f"of {name}: {_first(column)}" for name, column in self.columns.items() if np.any(column > 0)]
+            whirl = (
+                f"At {speed * 60 / (2 * math.pi):.6g} rpm the shaft whirls {', '.join(said) or f'at {_first(turns)}'}"
+            )
+            return f"{whirl}; critical speeds {'; '.join(critical)}." if critical else f"{whirl}."
         if not self.operating:
             (name, column), *_ = self.columns.items()
             met = [f"mode {k + 1} at {column[k]:.6g} rpm" for k in np.flatnonzero(np.isfinite(column))]
@@ -398,9 +414,32 @@ class OrderCrossings:
 
 def order_crossings(scene: Scene, parameters: Mapping[str, Any], values: Mapping[str, Any]) -> OrderCrossings | None:
     """The crossings of the frequencies among the results ``values`` of one point; None without frequencies or orders."""
-    name = next((name for name in FREQUENCIES if name in values), None)
+    name = next((name for name in (*FREQUENCIES, "whirl_frequency") if name in values), None)
     orders = orders_of(scene.system.name, {**parameters, **scene.data})
     if name is None or orders is None or scene.request.options.get("order"):
         return None
+    operating = operating_range(scene.request.options)
+    if orders.still or scene.analysis.name == "whirl":
+        orders = replace(orders, per_turn={**orders.per_turn, "order -1 (backward)": -1.0})
+        return OrderCrossings(orders, _turning_speeds(scene, parameters, orders), operating, turning=True)
     frequency = in_hertz(values[name], scene.analysis.variable(name).units)
-    return OrderCrossings(orders, orders.speeds(frequency), operating_range(scene.request.options))
+    return OrderCrossings(orders, orders.speeds(frequency), operating)
+
+
+def _turning_speeds(scene: Scene, parameters: Mapping[str, Any], orders: Orders) -> np.ndarray:
+    """Critical speeds [rpm] of the ``orders`` of a shaft with the gyroscopic effect (modes, orders); NaN where none is."""
+    # Local import: other points need no function of a pytree.
+    from drivetrain_jax.analyses import analyse
+
+    shaft, modes = scene.system.of(parameters), scene.request.options["modes"]
+    # Half of the modes of whirl are backward.
+    modes = -(-modes // 2) if scene.analysis.name == "whirl" else modes
+    asked = ({"order": int(n), "modes": modes} for n in orders.per_turn.values())
+    columns = [analyse("critical_speeds", shaft, ["critical_speed"], options).critical_speed for options in asked]
+    speeds = np.stack(columns, axis=-1)
+    return np.where(np.isfinite(speeds) & (speeds > 0), speeds, np.nan)
+
+
+def _first(speeds: np.ndarray) -> str:
+    """The first speeds [rpm] as text."""
+    return f"{', '.join(f'{x:.6g}' for x in speeds[np.isfinite(speeds)][:_FEW])} rpm"

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
+from threading import current_thread, main_thread
 from typing import TYPE_CHECKING, Any
 
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
-from drivetrain_jax._machine import StatusLine, notebook, physical_memory, terminal
+from drivetrain_jax._machine import StatusLine, notebook, physical_memory, stop_on_signals, terminal
 from drivetrain_jax.runs.assemble import ZarrBlocks
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.output import HDF5, ZARR, Output
@@ -80,11 +82,24 @@ def run(
     executor = make_executor(threads, workers, dask)
     if out is None and reuse:
         raise InputError("reuse: given without out; expected a run into a file")
-    with ProgressLine() if report is None and notebook() else nullcontext(report) as show:
+    # The handler of a caller, or of another thread, stays.
+    ours = current_thread() is main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    shown = ProgressLine() if report is None and notebook() else nullcontext(report)
+    with shown as show, stop_on_signals(*[signal.SIGINT] * ours) as check:
+
+        def reported(progress: Progress) -> None:
+            check()
+            if show is not None:
+                show(progress)
+
         if out is None:
-            return _in_memory(_job(scene, overrides, on_disk=False), executor, show)
-        how: dict[str, Any] = {"fresh": fresh, "executor": executor, "reuse": reuse, "report": show}
-        run_to_file(scene, Path(out), overrides=overrides, store=HDF5, **how)
+            return _in_memory(_job(scene, overrides, on_disk=False), executor, reported)
+        how: dict[str, Any] = {"fresh": fresh, "executor": executor, "reuse": reuse, "report": reported}
+        try:
+            run_to_file(scene, Path(out), overrides=overrides, store=HDF5, **how)
+            check()
+        except KeyboardInterrupt as stop:
+            raise stop if isinstance(stop, Interrupted) else Interrupted(Progress(0)) from None
     return open_result(Path(out))
 
 

@@ -394,15 +394,21 @@ PHYSICAL = PhysicalData(
 )
 
 
+def _check_apart(angles: Any) -> list[float]:
+    """The differences of concrete ``angles`` of planets; :class:`~drivetrain_jax.InputError` if three or more are equal."""
+    if not isinstance(angles, tuple) or not all(isinstance(angle, (int, float)) for angle in angles):
+        return []
+    apart = [math.remainder(a - b, 2 * math.pi) for i, a in enumerate(angles) for b in angles[:i]]
+    if len(angles) > 2 and all(abs(gap) < 1e-9 for gap in apart):
+        raise InputError(f"planet_angle = {list(angles)}: all planets are in one place; expected different angles")
+    return apart
+
+
 def check(fixed: Mapping[str, Any]) -> None:
     """Raise ``ValueError`` unless all lists have the same length, one entry per planet; warn of planets in one place."""
     angles = fixed.get("planet_angle")
-    if angles is not None and all(isinstance(angle, (int, float)) for angle in angles):
-        apart = [math.remainder(a - b, 2 * math.pi) for i, a in enumerate(angles) for b in angles[:i]]
-        if len(angles) > 2 and all(abs(gap) < 1e-9 for gap in apart):
-            raise ValueError(f"planet_angle = {list(angles)}: all planets are in one place; expected different angles")
-        if any(abs(gap) < 1e-9 for gap in apart):
-            warnings.warn(f"planet_angle = {list(angles)}: several planets are in one place", stacklevel=2)
+    if any(abs(gap) < 1e-9 for gap in _check_apart(angles)):
+        warnings.warn(f"planet_angle = {list(angles or ())}: several planets are in one place", stacklevel=2)
     for name in (*PER_PLANET, *ERRORS):
         value = fixed.get(name)
         if isinstance(value, tuple) and angles is not None and len(value) != len(angles):
@@ -505,6 +511,10 @@ class Planetary(System):
     T_s: Number = parameter("N", "torque on the sun over its base radius", default=0.0)
     T_r: Number = parameter("N", "torque on the ring over its base radius", default=0.0)
     T_c: Number = parameter("N", "torque on the carrier over its radius", default=0.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_apart(self.planet_angle)
 
     @serves("modes", check=check, parameters=_OF_SPRINGS)
     def springs(self) -> SpringSystem:

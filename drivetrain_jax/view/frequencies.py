@@ -546,5 +546,5 @@ def _interference(dataset: xr.Dataset, orders: Orders, colours: Any, kinds: Mapp
             sheet.later(partial(write_names, axes, list(numbers.values()), list(numbers), offset=4.0, **_NUMBER))
     if operating:
         sheet.add(axes.axvspan(*operating, **_OPERATING))
-    sheet.label(f"speed of the {orders.shaft} [rpm]", "natural frequency [Hz] (number of the mode at the right)")
+    sheet.label(f"speed of the {orders.shaft} [rpm]", f"{orders.frequency} [Hz] (number of the mode at the right)")
     return sheet.finish(dataset)

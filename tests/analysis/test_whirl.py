@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis.critical_speeds.coupled import directions
@@ -260,6 +261,27 @@ def test_a_campbell_diagram(tmp_path):
     labels = texts(figure)
     # 230.06781739 and 688.74457908 rad/s of order 1, half of 224, 675, ... of order 2, in rpm.
     assert {"2197", "6577"} <= {*labels} and legend(figure)[:2] == ["backward", "forward"]
+
+
+@pytest.mark.full
+def test_a_point_begins_with_whirl_and_critical_speeds():
+    """An overhung disc: of (50 EI/L^3 - m p^2) and its tilt the closed forms of docs/theory/bicardan.md."""
+    disc = {"length": [0.4], "EI": [3e4], "rhoA": [0.0], "k_A": math.inf, "k_rot_A": math.inf, "k_D": 0.0, "m_D": 12.0}
+    found = dt.point("bicardan", "whirl", **disc, I_D=0.09, Ip_D=0.17, speed="2000 rpm", modes=2)
+    rates = {"order 1": 1.0, "order 2 (joints)": 2.0, "order -1 (backward)": -1.0}
+    stiff = 3e4 * np.array([[12 / 0.4**3, -6 / 0.4**2], [-6 / 0.4**2, 4 / 0.4]])
+    speeds = {}
+    for name, n in rates.items():
+        # The tilt turns with the vibration: its inertia is I - Ip/n.
+        squares = scipy.linalg.eigvals(stiff, np.diag([12.0, 0.09 - 0.17 / n])).real
+        speeds[name] = np.sqrt(squares[squares > 0].min()) / abs(n) * 30 / np.pi
+        np.testing.assert_allclose(found.crossings[name], [speeds[name]], rtol=1e-10)
+    turns = np.asarray(found.whirl_frequency) * 30 / np.pi
+    assert found.sentence == (
+        f"At 2000 rpm the shaft whirls backward at {turns[0]:.6g} rpm, forward at {turns[1]:.6g} rpm; "
+        f"critical speeds {'; '.join(f'of {name}: {speed:.6g} rpm' for name, speed in speeds.items())}."
+    )
+    assert "with the gyroscopic effect" in repr(found)
 
 
 def test_wrong_input_is_one_line():

@@ -9,9 +9,12 @@ import sys
 import time
 from contextlib import suppress
 
+import jax
+import numpy as np
 import pytest
 
-from drivetrain_jax.cli import _stop_on_signals
+import drivetrain_jax as dt
+from drivetrain_jax._machine import stop_on_signals
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
 
@@ -19,8 +22,11 @@ NUMBERS = (signal.SIGINT, signal.SIGTERM)
 class Interrupted:
     """Its destructor swallows the exception of a signal that comes meanwhile."""
 
+    def __init__(self, number=signal.SIGTERM):
+        self.number = number
+
     def __del__(self):
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), self.number)
         for _ in range(1000):
             pass
 
@@ -33,7 +39,7 @@ class Broken:
 def test_a_swallowed_interrupt_is_raised_again_and_not_reported(monkeypatch):
     reported = []
     monkeypatch.setattr(sys, "unraisablehook", reported.append)
-    with _stop_on_signals() as check:
+    with stop_on_signals(*NUMBERS) as check:
         check()
         Interrupted()
         with pytest.raises(KeyboardInterrupt):
@@ -44,10 +50,36 @@ def test_a_swallowed_interrupt_is_raised_again_and_not_reported(monkeypatch):
     assert sys.unraisablehook.__self__ is reported
 
 
+def test_an_interrupt_in_a_callback_of_jax_stops_python(tmp_path):
+    sent = []
+
+    def twice(values):
+        def host(x):
+            if not sent:
+                sent.append(x)
+                os.kill(os.getpid(), signal.SIGINT)
+            return np.asarray(2 * x)
+
+        return jax.pure_callback(host, jax.ShapeDtypeStruct((), float), values["x"], vmap_method="sequential")
+
+    with pytest.raises(dt.Interrupted, match="interrupted; the same call resumes"):
+        dt.sweep(twice, {"x": 0.0}, over={"x": [1.0, 2.0]}, out=tmp_path / "twice.nc")
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_interrupt_that_a_destructor_swallows_stops_python_too(tmp_path):
+    def report(_):
+        Interrupted(signal.SIGINT)
+
+    scene = {"system": "tripod", "analysis": "parameters", "fixed": {"element": "input", "beta": 0.1}}
+    with pytest.raises(dt.Interrupted, match="interrupted; the same call resumes"):
+        dt.run(scene, tmp_path / "tripod.nc", report=report)
+
+
 @pytest.mark.parametrize("stopped", [True, False])
 def test_the_handlers_of_before_are_back(stopped):
     before = [signal.getsignal(number) for number in NUMBERS]
-    with suppress(KeyboardInterrupt), _stop_on_signals():
+    with suppress(KeyboardInterrupt), stop_on_signals(*NUMBERS):
         assert not {signal.getsignal(number) for number in NUMBERS} & set(before)
         if stopped:
             os.kill(os.getpid(), signal.SIGTERM)

@@ -54,8 +54,11 @@ def test_planets_in_one_place_are_warned_of(angles):
 
 
 def test_planets_that_are_all_in_one_place_are_refused():
-    with pytest.raises(InputError, match=r"planet_angle = \[0.0, 0.0, 0.0\]: all planets are in one place; expected"):
+    message = r"planet_angle = \[0.0, 0.0, 0.0\]: all planets are in one place; expected different angles$"
+    with pytest.raises(InputError, match=f"^fixed.{message}"):
         load_scene(SCENE | {"fixed": {"planet_angle": [0.0, 0.0, 0.0]}})
+    with pytest.raises(InputError, match=f"^{message}"):
+        dt.Planetary(planet_angle=[0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("model", full_after(1, ["rotational", "plane"]))
