@@ -41,14 +41,8 @@ def scenes(quick: bool) -> dict[str, dict[str, Any]]:
     def scene(what: str, outputs: list[str], axes: Mapping[str, Any], fixed: Mapping[str, Any], **options: Any) -> Any:
         system, analysis = what.split()
         ranges = {name: {"start": a, "stop": b, "num": n // 10 if quick else n} for name, (a, b, n) in axes.items()}
-        return {
-            "system": system,
-            "analysis": analysis,
-            "outputs": outputs,
-            "axes": ranges,
-            "fixed": dict(fixed),
-            "options": options,
-        }
+        names = {"system": system, "analysis": analysis, "outputs": outputs}
+        return names | {"axes": ranges, "fixed": dict(fixed), "options": options}
 
     return {
         "cardan, chart direct": scene("cardan floquet", ["spectral_radius", "verdict"],
@@ -96,14 +90,10 @@ def row(number: int, name: str, measured: Sequence[dict[str, Any]], folders: Seq
     """A line of accelerator.csv, from times and results of the accelerator and of the cores."""
     device, cores = (one[name] for one in measured)
     return {
-        "scene": name,
-        "points": cores["points"],
-        "cores_per_s": cores["points"] / cores["seconds"],
-        "accelerator_per_s": device["points"] / device["seconds"],
-        "times": cores["seconds"] / device["seconds"],
-        "first_s": device["first_s"],
-        "difference": difference(*(folder / f"{number}.npz" for folder in folders)),
-    }
+        "scene": name, "points": cores["points"], "cores_per_s": cores["points"] / cores["seconds"],
+        "accelerator_per_s": device["points"] / device["seconds"], "times": cores["seconds"] / device["seconds"],
+        "first_s": device["first_s"], "difference": difference(*(folder / f"{number}.npz" for folder in folders)),
+    }  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> None:

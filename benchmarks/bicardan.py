@@ -134,11 +134,8 @@ def dynamic_stiffness(region: str, rtol: float) -> Job:
 
 
 def _two_references(regions: Sequence[str]) -> list[str]:
-    return [
-        "; ".join(
-            f"{name}: finite elements differ from the determinant by {reference(name)[1]:.0e}" for name in regions
-        )
-    ]
+    apart = (f"{name}: finite elements differ from the determinant by {reference(name)[1]:.0e}" for name in regions)
+    return ["; ".join(apart)]
 
 
 _ELEMENTS = partial(_one_by_one, "scipy, Hermite elements", hermite_frequencies, "elements", "{} elements a segment")

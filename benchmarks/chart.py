@@ -198,19 +198,12 @@ def cold(region: str, rtol: float) -> Job:
 
     folder = Path(tempfile.mkdtemp(prefix="benchmarks-"))
     (folder / "scene.toml").write_text(toml.write({"title": "atlas"} | scene(ATLASES[region], "atlas", rtol)))
-    words = [
-        sys.executable,
-        "-m",
-        "drivetrain_jax.cli",
-        "run",
-        str(folder / "scene.toml"),
-        "--out",
-        str(folder / "cold.nc"),
-    ]
+    command = "run", str(folder / "scene.toml"), "--out", str(folder / "cold.nc"), "--fresh"
 
     def job() -> Any:
         environment = os.environ | {"DRIVETRAIN_JAX_CACHE": "0"}
-        subprocess.run([*words, "--fresh"], check=True, capture_output=True, env=environment)
+        words = [sys.executable, "-m", "drivetrain_jax.cli", *command]
+        subprocess.run(words, check=True, capture_output=True, env=environment)
         return folder / "cold.nc"
 
     return job

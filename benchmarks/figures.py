@@ -99,14 +99,8 @@ def _panel(ax: Any, title: str, pairs: Sequence[Any]) -> None:
         faster, slower = ratio >= _LEVEL, ratio <= 1 / _LEVEL
         colour = ALONE if math.isinf(ratio) else FASTER if faster else SLOWER if slower else EQUAL
         ax.barh(place, width - 1, left=1.0, color=colour, height=0.72)
-        words = {math.inf: "alone at this error", 0.0: f"{rival} alone"}.get(ratio, f"{ratio:.2g}  {rival}")
-        words = (
-            "no method reaches the error"
-            if math.isnan(ratio)
-            else words
-            if ratio < 100 or math.isinf(ratio)
-            else f"{ratio:,.0f}  {rival}"
-        )
+        words = {math.inf: "alone at this error", 0.0: f"{rival} alone"}.get(ratio, f"{ratio:,.3g}  {rival}")
+        words = "no method reaches the error" if math.isnan(ratio) else words
         ax.text(max(width, 1.0), place, f" {words}", va="center", fontsize=7)
     ax.axvline(1.0, color="black", lw=0.8)
     ax.set(xscale="log", xlim=(low, 3e6), ylim=(len(pairs) - 0.4, -0.6))

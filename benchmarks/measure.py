@@ -19,7 +19,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache, partial, wraps
 from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import get_context
@@ -29,6 +29,8 @@ from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from drivetrain_jax._machine import instruction_set, machine
 
 RESULTS = Path(__file__).resolve().parent / "results"
 CORES = 2
@@ -43,6 +45,8 @@ GOAL = 1e-9
 _PACKAGES = ("numpy", "scipy", "jax", "diffrax", "heyoka", "drivetrain_jax")
 Columns = Mapping[str, np.ndarray]
 Job = Callable[[], Any]
+# A line of a Markdown table: its cells, or its text with `` | `` between them.
+Line = str | Sequence[str]
 
 
 class Judged(NamedTuple):
@@ -58,8 +62,7 @@ def judged(error: float, notice: str = "") -> Judged:
     return Judged(float(error), 0, notice) if math.isfinite(error) else Judged(math.nan, 1, notice or "nan")
 
 
-@dataclass(frozen=True)
-class Rung:
+class Rung(NamedTuple):
     """One method at one setting in one region: a line of the CSV.
 
     ``error`` is the largest relative error of the points with a result. ``noticed`` is the way in which a user learns of a
@@ -79,8 +82,7 @@ class Rung:
     timed: int = 1
 
 
-@dataclass(frozen=True)
-class Contender:
+class Contender(NamedTuple):
     """A method at a setting: ``prepare`` compiles and returns the job, ``error_of`` compares its result."""
 
     system: str
@@ -145,7 +147,9 @@ class Study:
         about = f"medians of up to {repeats} runs in turns, as many as {spent:g} s allow ('timed'), without compilation"
         notes = [about, *self.notes(self.quick if quick else self.regions)]
         write_csv(
-            folder / f"precision_{self.system}.csv", list(map(asdict, measure(contenders, repeats, spent))), notes
+            folder / f"precision_{self.system}.csv",
+            [rung._asdict() for rung in measure(contenders, repeats, spent)],
+            notes,
         )
 
 
@@ -153,26 +157,21 @@ def measure(contenders: Sequence[Contender], repeats: int = REPEATS, spent: floa
     """One rung per contender: all are compiled and compared first, then timed in turns; times are medians."""
     prepared = at_once([partial(_prepared, contender) for contender in contenders])
     jobs, rungs = {}, []
-    for number, (contender, (job, compile_s)) in enumerate(zip(contenders, prepared, strict=True)):
-        verdict, seconds, ran = _first(contender, job)
-        c = contender
-        rungs.append(
-            Rung(c.system, c.region, c.method, c.setting, verdict.error, seconds, compile_s, c.points,
-                 int(verdict.failed), verdict.noticed)
-        )  # fmt: skip
+    for number, (c, (job, compile_s)) in enumerate(zip(contenders, prepared, strict=True)):
+        verdict, seconds, ran = _first(c, job)
         if ran and seconds <= spent:
             jobs[number] = job
+        failed, noticed = int(verdict.failed), verdict.noticed
+        rungs.append(Rung(*c[:4], verdict.error, seconds / c.points, compile_s, c.points, failed, noticed))
         what = f"{c.region}: {c.method}, {c.setting}"
         sys.stderr.write(f"{number + 1}/{len(contenders)} {what}: {verdict.error:.1e}, {seconds:.2g} s\n")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        runs = {number: min(repeats, int(spent / rungs[number].seconds_per_point)) for number in jobs}
-        times = interleaved(jobs, runs)
-    counted = [times.get(number, [rung.seconds_per_point]) for number, rung in enumerate(rungs)]
-    return [
-        Rung(**asdict(rung) | {"seconds_per_point": median(seconds) / rung.points, "timed": len(seconds)})
-        for rung, seconds in zip(rungs, counted, strict=True)
-    ]
+        one_run = {number: rungs[number].seconds_per_point * rungs[number].points for number in jobs}
+        times = interleaved(jobs, {number: min(repeats, int(spent / one_run[number])) for number in jobs})
+    for number, runs in times.items():
+        rungs[number] = rungs[number]._replace(seconds_per_point=median(runs) / rungs[number].points, timed=len(runs))
+    return rungs
 
 
 def _prepared(contender: Contender) -> tuple[Job | Exception, float]:
@@ -372,6 +371,13 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], notes: Sequence[str
     os.replace(written, path)
 
 
+def markdown(head: Line, rows: Sequence[Line]) -> str:
+    """A Markdown table."""
+    lines = [line if isinstance(line, str) else " | ".join(line) for line in (head, *rows)]
+    lines.insert(1, " | ".join(["---"] * len(lines[0].split(" | "))))
+    return "\n".join(f"| {line} |" for line in lines)
+
+
 class Results(NamedTuple):
     """A result file: its rows as a DataFrame, the provenance and the notes of its head."""
 
@@ -409,17 +415,17 @@ def provenance() -> dict[str, str]:
 
 def _commit() -> str:
     """The commit of the code that runs, with a remark if its files differ from it."""
-    words = (["rev-parse", "--short", "HEAD"], ["status", "--porcelain", "--", "../drivetrain_jax", "*.py"])
+
+    def git(*words: str) -> str:
+        return subprocess.run(
+            ["git", *words], cwd=RESULTS.parent, check=True, capture_output=True, text=True
+        ).stdout.strip()
+
     try:
-        commit, changes = (
-            subprocess.run(
-                ["git", *line], cwd=RESULTS.parent, check=True, capture_output=True, text=True
-            ).stdout.strip()
-            for line in words
-        )
+        changed = " with changes" * bool(git("status", "--porcelain", "--", "../drivetrain_jax", "*.py"))
+        return git("rev-parse", "--short", "HEAD") + changed
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
-    return f"{commit} with changes" if changes else commit
 
 
 def _busy() -> float:
@@ -445,11 +451,6 @@ def _version(package: str) -> str:
 
 
 def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    fields = {key.strip(): value for key, _, value in (line.partition(":") for line in lines)}
-    flags = fields.get("flags", "")
+    flags = instruction_set()
     simd = "AVX-512" if "avx512f" in flags else "AVX2" if "avx2" in flags else "no AVX2"
-    return f"{fields.get('model name', platform.machine()).strip()} ({simd})"
+    return f"{machine().partition(',')[0]} ({simd})"

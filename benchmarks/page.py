@@ -11,15 +11,15 @@ from __future__ import annotations
 import argparse
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from benchmarks import figures
-from benchmarks.atlas_attack import CASES
-from benchmarks.measure import GOAL, PATIENCE, RESULTS, USELESS, Results, is_silent, load
+from benchmarks.measure import GOAL, PATIENCE, RESULTS, USELESS, is_silent, load, markdown
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE, README, ATLAS_PAGE = ROOT / "docs" / "benchmarks.md", ROOT / "README.md", ROOT / "docs" / "theory" / "atlas.md"
@@ -42,8 +42,6 @@ TITLES = {
 _TWO_CORES = ("chart", "atlas")
 # Ratio of times up to which two methods count as equally fast.
 LEVEL = 1.1
-# Mean number of cores used by other programs from which a measurement counts as disturbed.
-_OTHERS = 0.5
 
 
 def rungs(folder: Path) -> pd.DataFrame:
@@ -80,17 +78,17 @@ def compared(rows: pd.DataFrame) -> list[Compared]:
             pairs += [(system, f"{row.method[9:]}, {region}", row, rival) for row in part.itertuples()]
         else:
             pairs.append((system, region, _fastest(reached[reached.own]), rival))
-    return [Compared(*pair, _ratio(*pair[2:])) for pair in pairs]
+    with np.errstate(invalid="ignore"):
+        return [Compared(*pair, _time(pair[3]) / _time(pair[2])) for pair in pairs]
+
+
+def _time(row: Any) -> np.float64:
+    """Time per point, infinite without a method that reaches the error."""
+    return np.float64(math.inf if row is None else row.seconds_per_point)
 
 
 def _fastest(rows: pd.DataFrame) -> Any:
     return next(rows.sort_values("seconds_per_point").itertuples(), None)
-
-
-def _ratio(package: Any, rival: Any) -> float:
-    if package is None or rival is None:
-        return math.nan if package is rival else math.inf if rival is None else 0.0
-    return rival.seconds_per_point / package.seconds_per_point
 
 
 def write_pages() -> None:
@@ -125,14 +123,13 @@ def text_of(folder: Path, page: Path) -> str:
         answer(pairs) if pairs else not_measured("precision_cardan"),
         f"![Every comparison of the table]({images}ratios.png)",
         "Written by `python -m benchmarks.page` from the files in `benchmarks/results/`, which have every setting of every "
-        "method, and the versions of all packages; `drivetrain bench` measures them again. " + machines(folder),
-        *warnings(folder),
+        "method, and the versions of all packages; `drivetrain bench` measures them again.",
         "## The cardan chart",
         _chart(folder, rows),
         "## Regions of every system",
         f"Time per point of the fastest method, and its error. The error of every setting: {links}.",
-        markdown(("system", "region", "package", "fastest rival", "ratio"), [
-            [p.system, p.region, _timing(p.package), _timing(p.rival), times(p.ratio) if 0 < p.ratio < math.inf else ""]
+        markdown("system | region | package | fastest rival | ratio", [
+            [p.system, p.region, _timing(p.package), _timing(p.rival), number(p.ratio) if 0 < p.ratio < math.inf else ""]
             for p in pairs
         ]),
         "\n".join(not_measured(f"precision_{system}") for system in TITLES if system not in set(rows.system)),
@@ -142,9 +139,13 @@ def text_of(folder: Path, page: Path) -> str:
         "elements asks for no tolerance.",
         silence(rows),
         "## Commands",
-        "CPU seconds of a process with its start. `first`: without compiled code; later processes find it; `aim`: wanted.",
-        _waiting(load(folder, "waiting")),
-        _accelerator(load(folder, "accelerator")),
+        _file_table(folder, "waiting", {"command": "command", "first_cpu_s": "first", "cpu_s": "later", "aim_s": "aim"}),
+        "## An accelerator beside the cores of its machine",
+        _file_table(folder, "accelerator", {"scene": "scene", "points": "points", "cores_per_s": "points/s, cores",
+                                            "accelerator_per_s": "points/s, accelerator", "times": "ratio"}),
+        "## The measurements",
+        "`load`: cores used by other programs. More than half a core disturbs a measurement.",
+        measurements(folder),
     ]  # fmt: skip
     return "\n\n".join(part.rstrip("\n") for part in parts if part) + "\n"
 
@@ -153,46 +154,41 @@ def answer(pairs: Sequence[Compared]) -> str:
     """The number of regions where the package is faster, level and slower, and its smallest and largest ratio."""
     lines = []
     for system in dict.fromkeys(pair.system for pair in pairs):
-        known = sorted(
-            (p for p in pairs if p.system == system and not math.isnan(p.ratio)), key=lambda pair: pair.ratio
-        )
+        known = sorted((p for p in pairs if p.system == system and not math.isnan(p.ratio)), key=lambda p: p.ratio)
         faster, slower = sum(p.ratio >= LEVEL for p in known), sum(p.ratio <= 1 / LEVEL for p in known)
         ends = [_extreme(known[0]), _extreme(known[-1])] if known else ["none", "none"]
         lines.append([TITLES[system], *map(str, (faster, len(known) - faster - slower, slower)), *ends])
-    return markdown(("comparison", "faster", "level", "slower", "smallest ratio", "largest ratio"), lines)
+    return markdown("comparison | faster | level | slower | smallest ratio | largest ratio", lines)
 
 
 def _extreme(pair: Compared) -> str:
     words = {math.inf: "no rival reaches the error", 0.0: "only a rival reaches the error"}
     rival = f", {pair.rival.method}" if pair.rival is not None else ""
-    return f"{words.get(pair.ratio) or times(pair.ratio)} ({pair.region}{rival})"
+    return f"{words.get(pair.ratio) or number(pair.ratio)} ({pair.region}{rival})"
 
 
 def _timing(row: Any) -> str:
     if row is None:
         return "does not reach the error"
-    return f"{row.method.removeprefix('package, ')}: {seconds(row.seconds_per_point)} ({small(row.error)})"
+    return f"{row.method.removeprefix('package, ')}: {number(1e6 * row.seconds_per_point)} us ({row.error:.1e})"
 
 
 def losses(pairs: Sequence[Compared]) -> str:
     """A sentence that counts the regions where a rival is faster."""
     ratios = [pair.ratio for pair in pairs if pair.system not in _TWO_CORES]
     behind = [1 / ratio for ratio in ratios if 0 < ratio <= 1 / LEVEL]
-    where = f"{len(behind)} of {len(ratios)} regions (error {GOAL:g}, one core)"
-    return (
-        f"Another library is faster in {where}, up to {times(max(behind))} times."
-        if behind
-        else f"No other library is faster in any of {where}."
-    )
+    most = f", up to {number(max(behind))} times" if behind else ""
+    return f"Another library is faster in {len(behind)} of {len(ratios)} regions (error {GOAL:g}, one core){most}."
 
 
 def silence(rows: pd.DataFrame) -> str:
     """The methods that fail silently, the package's first, with the number of their regions."""
     flags = [is_silent(row.setting, row.error, row.failed, row.noticed) for row in rows.itertuples()]
-    failed = rows[pd.Series(flags, rows.index, bool)].groupby(["own", "method"], sort=False)[["system", "region"]]
-    regions = {key: list(dict.fromkeys(map(" ".join, part.values.tolist()))) for key, part in failed}
-    package = [f"{method} ({', '.join(places)})" for (own, method), places in regions.items() if own]
-    rivals = [f"{method} ({len(places)})" for (own, method), places in regions.items() if not own]
+    failed = rows[np.array(flags, bool)].drop_duplicates(["method", "system", "region"]).astype({"own": bool})
+    package = [f"{row.method} ({row.system} {row.region})" for row in failed[failed.own].itertuples()]
+    rivals = [
+        f"{method} ({count})" for method, count in failed[~failed.own].groupby("method", sort=False).size().items()
+    ]
     head = (
         f"**The package fails silently**: {'; '.join(package)}."
         if package
@@ -201,41 +197,32 @@ def silence(rows: pd.DataFrame) -> str:
     return f"{head} Rivals, with the number of their regions: {', '.join(rivals) or 'none'}."
 
 
-def warnings(folder: Path) -> list[str]:
-    """A line if the files are of several commits, and one if other programs used the machine."""
+def measurements(folder: Path) -> str:
+    """Date, commit, machine and load of every file."""
     facts = {path.stem: file.facts for path in sorted(folder.glob("*.csv")) if (file := load(folder, path.stem))}
-    commits: dict[str, list[str]] = {}
-    for name in sorted(facts.keys() - {"atlas_attack"}):
-        commits.setdefault(facts[name].get("commit", "unknown"), []).append(name)
-    lines, most = [], max(commits.values(), key=len, default=[])
-    if len(commits) > 1:
-        which = (
-            f"{commit} ({'most files' if names is most else ', '.join(sorted(names))})"
-            for commit, names in sorted(commits.items())
-        )
-        lines.append(f"**Several commits**: {', '.join(which)}.")
-    loads = {
-        name: float(words[0]) for name, one in facts.items() if (words := one.get("load", "").partition(" cores"))[1]
-    }
-    if busy := [f"{name} ({load:g})" for name, load in loads.items() if load > _OTHERS]:
-        lines.append(f"**Other programs used more than {_OTHERS} cores** during: {', '.join(busy)}.")
-    return lines
+    names = ("date", "commit", "machine", "load")
+    return markdown(("file", *names), [
+        [stem, *(one.get(name, "").removesuffix(" cores by other programs") for name in names)]
+        for stem, one in facts.items()
+    ])  # fmt: skip
 
 
-def machines(folder: Path) -> str:
-    """A sentence that names the machines of all files."""
-    files = (load(folder, path.stem) for path in folder.glob("*.csv") if path.stem != "atlas_attack")
-    names = sorted({file.facts["machine"] for file in files if file})
-    return (
-        f"{'Machines' if len(names) > 1 else 'Machine'}: {'; '.join(names)}." if names else "Nothing has been measured."
-    )
+def _file_table(folder: Path, name: str, columns: dict[str, str]) -> str:
+    """Columns of a file by their names on the page, under its notes."""
+    file = load(folder, name)
+    if file is None:
+        return not_measured(name)
+    rows = file.rows[list(columns)].itertuples(index=False)
+    table = markdown(list(columns.values()), [[x if isinstance(x, str) else number(x) for x in row] for row in rows])
+    return "\n\n".join([*file.notes, table])
 
 
 _CHART_HEAD = ("method", "cells that it computed", "cells/s", "largest error")
 
 
 def _chart_row(row: Any, mark: str = "") -> list[str]:
-    cells = (f"{row.method}, {row.setting}", f"{row.points:,}", count(1 / row.seconds_per_point), small(row.error))
+    error = "none" if math.isnan(row.error) else f"{row.error:.1e}"
+    cells = (f"{row.method}, {row.setting}", f"{row.points:,}", number(1 / row.seconds_per_point), error)
     return [f"{mark}{cell}{mark}" for cell in cells]
 
 
@@ -274,13 +261,8 @@ def readme_part(folder: Path) -> str:
         f"its fastest setting with an error of at most {GOAL:g}, or at its most accurate setting if it never gets there. "
         f"`direct` and `diffrax` give an error bound for every cell. Machine: {file.facts['machine']}."
     )
-    return "\n\n".join(
-        [
-            head,
-            markdown(_CHART_HEAD, table),
-            "\n".join(f"- {line}" for line in (*_highlights(rows, pairs), losses(pairs))),
-        ]
-    )
+    lines = "\n".join(f"- {line}" for line in (*_highlights(rows, pairs), losses(pairs)))
+    return f"{head}\n\n{markdown(_CHART_HEAD, table)}\n\n{lines}"
 
 
 LABELS = {
@@ -295,12 +277,12 @@ LABELS = {
 def _highlights(rows: pd.DataFrame, pairs: Sequence[Compared]) -> list[str]:
     lines = []
     for pair in (pair for pair in pairs if (pair.system, pair.region) == ("bicardan", "typical")):
-        rate = count(1 / pair.package.seconds_per_point)
+        rate = number(1 / pair.package.seconds_per_point)
         speed = against(pair.ratio, f"the best other method ({pair.rival.method})")
         lines.append(f"Stepped shaft: {rate} shafts/s on one core with six certified critical speeds each, {speed}.")
     rates = 1 / rows[rows.system == "atlas"].groupby("method").seconds_per_point.min()
     words = {"package, evaluation": "grid cells", "package, points": "scattered points"}
-    speeds = [f"up to {count(rates[method])} {what} per second" for method, what in words.items() if method in rates]
+    speeds = [f"up to {number(rates[method])} {what} per second" for method, what in words.items() if method in rates]
     charts = [f"{pair.region}: {against(pair.ratio, pair.rival.method)}" for pair in pairs if pair.system == "atlas"]
     if speeds:
         lines.append(f"Evaluation of an atlas, with bounds and verdicts: {'; '.join(speeds)}.")
@@ -308,129 +290,52 @@ def _highlights(rows: pd.DataFrame, pairs: Sequence[Compared]) -> list[str]:
     return lines
 
 
-def _waiting(file: Results | None) -> str:
-    if file is None:
-        return not_measured("waiting")
-    lines = [
-        [row.command, f"{row.first_cpu_s:g}", f"{row.cpu_s:g}", f"{row.aim_s:g}" if row.aim_s != "" else ""]
-        for row in file.rows.itertuples()
-    ]
-    return markdown(("command", "first", "later", "aim"), lines)
-
-
-def _accelerator(file: Results | None) -> str:
-    if file is None:
-        return "No GPU was available: all figures are from the processors named above."
-    rates = (
-        f"{row.scene} {count(row.accelerator_per_s)} points/s, {against(row.times, 'the cores')}"
-        for row in file.rows.itertuples()
-    )
-    device, cores = file.notes[0].partition(";")[0], file.facts["machine"].rpartition(", ")[2]
-    text = f"On an accelerator ({device}), compared with the {cores} of its machine: {'; '.join(rates)}."
-    return " ".join([text, *file.notes[1:]])
-
-
-_SYMBOLS = {"beta": r"\beta", "Omega": r"\Omega", "mu": r"\mu", "alpha": r"\alpha", "zeta": r"\zeta"}
-_SIZES = ("tolerance", "polynomials", "solves", "arrays of the file", "largest relative error of $Z$")
-_ERRORS = (
-    r"error of $\rho$",
-    "random",
-    r"nearest $\rho = 1$",
-    "widest bound",
-    "undecided",
-    "broken bounds",
-    "wrong verdicts",
-)
-
-
 def atlas_part(folder: Path) -> str:
     """The measured part of docs/theory/atlas.md, from atlas_attack.csv."""
     file = load(folder, "atlas_attack")
     if file is None:
         return not_measured("atlas_attack")
-    rows = {row["case"]: row for row in file.rows.to_dict("records")}
-
-    def table(head: Sequence[str], cells: Callable[[Mapping[str, Any]], list[str]]) -> str:
-        lines = [
-            [chart_label(c), *(cells(rows[c.name]) if c.name in rows else ["not measured"] * len(head))] for c in CASES
-        ]
-        return markdown(("chart", *head), lines)
-
-    cells, few = (
-        " or ".join(f"{n:,}" for n in sorted({int(row[name]) for row in rows.values()})) for name in ("cells", "worst")
-    )
+    rows = file.rows
+    charts = [f"beta {r.beta}, Omega {r.Omega}, zeta {r.zeta}, alpha {r.alpha}, mu {r.mu}" for r in rows.itertuples()]
+    largest = {
+        kind: rows[[f"{kind}_direct", f"{kind}_precise"]].max(axis=1) for kind in ("random", "nearest", "widest")
+    }
+    sums = {what: rows[f"{what}_direct"] + rows[f"{what}_precise"] for what in ("violations", "wrong")}
+    sizes = [
+        f"{chart} | {r.tolerance:g} | {r.panels} | {r.solves:,} | {r.bytes / 1e6:.2g} MB | {r.z_error:.1e}"
+        for chart, r in zip(charts, rows.itertuples(), strict=True)
+    ]
+    errors = [
+        f"{chart} | {r.rho_error:.1e} | {r.random:.2g} | {r.nearest:.2g} | {r.widest:.2g} | {r.undecided:,} of {r.of:,} | "
+        f"{r.violations} | {r.wrong}"
+        for chart, r in zip(charts, rows.assign(**largest, **sums).itertuples(), strict=True)
+    ]
+    cells, few = (" or ".join(f"{n:,}" for n in np.unique(rows[name])) for name in ("cells", "worst"))
     text = (
         f"{cells} cells of each kind are compared with direct solves, {few} with 30 digits. Error of $\\rho$: 99.9 % "
         "quantile over the random cells. Random, nearest, widest: largest ratio of error to bound. The rounding of "
         "direct solves is subtracted from the error."
     )
-    return "\n\n".join([table(_SIZES, _sizes), text, table(_ERRORS, _errors), f"Machine: {file.facts['machine']}."])
+    first = "chart | tolerance | polynomials | solves | arrays of the file | largest relative error of $Z$"
+    second = (
+        r"chart | error of $\rho$ | random | nearest $\rho = 1$ | widest | undecided | broken bounds | wrong verdicts"
+    )
+    machine = f"Machine: {file.facts['machine']}."
+    return "\n\n".join([markdown(first, sizes), text, markdown(second, errors), machine])
 
 
-def chart_label(case: Any) -> str:
-    """Ranges of a case and its differences from the base case, in symbols."""
-    ranges = [
-        rf"{_SYMBOLS[name]} \in [{_number(low)}, {_number(high)}]" if low else rf"{_SYMBOLS[name]} \le {_number(high)}"
-        for name, (low, high) in case.ranges.items()
-    ]
-    return ", ".join(f"${x}$" for x in [*ranges, *(f"{_SYMBOLS[n]} = {_number(v)}" for n, v in case.change.items())])
-
-
-def _number(value: float) -> str:
-    digits, _, power = f"{value:g}".partition("e")
-    return ((rf"{digits}\cdot" if digits != "1" else "") + f"10^{{{int(power)}}}") if power else digits
-
-
-def _sizes(row: Mapping[str, Any]) -> list[str]:
-    panels = ", ".join(panel.replace("x", " x ") for panel in row["panels"].split())
-    return [
-        f"${_number(row['tolerance'])}$",
-        panels,
-        f"{row['solves']:,}",
-        f"{row['bytes'] / 1e6:.2g} MB",
-        small(row["z_error"]),
-    ]
-
-
-def _errors(row: Mapping[str, Any]) -> list[str]:
-    parts = [
-        f"{max(row[f'{kind}_{by}'] for by in ('direct', 'precise')):.2g}" for kind in ("random", "nearest", "widest")
-    ]
-    sums = [str(row[f"{what}_direct"] + row[f"{what}_precise"]) for what in ("violations", "wrong")]
-    return [small(row["rho_error"]), *parts, f"{row['undecided']:,} of {row['of']:,}", *sums]
-
-
-def count(number: float) -> str:
-    """A count or rate with three significant digits and separated thousands."""
-    return f"{float(f'{number:.3g}'):,.0f}" if number >= 100 else f"{number:.3g}"
-
-
-def small(error: float) -> str:
-    """An error with two significant digits, ``2.4e-10``."""
-    return "none" if math.isnan(error) else "0" if error == 0 else f"{error:.1e}"
-
-
-def seconds(time: float) -> str:
-    """A time in s, ms, us or ns."""
-    unit, scale = next((pair for pair in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)) if time >= pair[1]), ("ns", 1e-9))
-    return f"{count(time / scale)} {unit}"
-
-
-def times(ratio: float) -> str:
-    """A ratio with two significant digits (three above 100): ``1.7``, ``860``."""
-    return f"{float(f'{ratio:.2g}'):g}" if ratio < 100 else f"{float(f'{ratio:.3g}'):,.0f}"
+def number(value: float) -> str:
+    """A number with three significant digits and separated thousands."""
+    return f"{float(f'{value:.3g}'):,.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def against(ratio: float, rival: str) -> str:
     """A comparison of speeds in words."""
     if 1 / LEVEL < ratio < LEVEL:
         return f"level with {rival}"
-    return f"{times(ratio)} times as fast as {rival}" if ratio > 1 else f"{times(1 / ratio)} times slower than {rival}"
-
-
-def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table."""
-    return "\n".join("| " + " | ".join(line) + " |" for line in [head, ["---"] * len(head), *rows])
+    return (
+        f"{number(ratio)} times as fast as {rival}" if ratio > 1 else f"{number(1 / ratio)} times slower than {rival}"
+    )
 
 
 def between_marks(text: str, section: str) -> str:

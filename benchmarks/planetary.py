@@ -44,16 +44,8 @@ def gear(planets: int, **changed: Any) -> dict[str, Any]:
 
 _FREE = dict.fromkeys(("k_s", "k_r", "k_c", "k_su", "k_ru", "k_cu"), 0.0)
 _GRADED = {
-    "k_sp": 1e16,
-    "k_rp": 1e12,
-    "k_p": 1e6,
-    "k_s": 1.0,
-    "k_r": 1.0,
-    "k_c": 1.0,
-    "k_ru": 1.0,
-    "m_s": 1e-3,
-    "I_s": 1e-3,
-}
+    "k_sp": 1e16, "k_rp": 1e12, "k_p": 1e6, "k_s": 1.0, "k_r": 1.0, "k_c": 1.0, "k_ru": 1.0, "m_s": 1e-3, "I_s": 1e-3,
+}  # fmt: skip
 REGIONS: dict[str, dict[str, Any]] = {
     "equal planets": gear(4),
     "unequal spacing": gear(5) | {"planet_angle": (0.0, 1.1, 2.4, 3.9, 5.2)},

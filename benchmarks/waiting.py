@@ -17,7 +17,7 @@ import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple
+from typing import Any
 
 from benchmarks.measure import parser, results_folder, write_csv
 from drivetrain_jax.runs import toml
@@ -34,13 +34,6 @@ AIMS = {
     "run of a rattle response": (3.0, None),
     "chart and its figure": (4.0, None),
 }
-
-
-class Spent(NamedTuple):
-    """CPU and wall-clock seconds."""
-
-    cpu: float
-    wall: float
 
 
 def commands(folder: Path, turn: int) -> dict[str, list[list[str]]]:
@@ -73,43 +66,34 @@ def _changed(folder: Path, turn: int, name: str, parameter: str, value: float, s
     return str(path)
 
 
-def spent(lines: Sequence[Sequence[str]], cache: Path) -> Spent:
+def spent(lines: Sequence[Sequence[str]], cache: Path) -> tuple[float, float]:
     """CPU and wall-clock seconds of commands of the package, one after the other."""
-    cpu = wall = 0.0
+    cpu, begin = 0.0, time.perf_counter()
     for words in lines:
-        begin = time.perf_counter()
         process = subprocess.Popen(
-            [sys.executable, "-m", "drivetrain_jax.cli", *words],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
+            [sys.executable, "-m", "drivetrain_jax.cli", *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             env=os.environ | {"XDG_CACHE_HOME": str(cache)},
-        )
+        )  # fmt: skip
         _, code, usage = os.wait4(process.pid, 0)
         if code:
             raise RuntimeError(f"{' '.join(words)}: exit code {os.waitstatus_to_exitcode(code)}")
-        cpu, wall = cpu + usage.ru_utime + usage.ru_stime, wall + time.perf_counter() - begin
-    return Spent(cpu, wall)
+        cpu += usage.ru_utime + usage.ru_stime
+    return cpu, time.perf_counter() - begin
 
 
 def measure(folder: Path, repeats: int) -> list[dict[str, Any]]:
     """A row for every command: the first process, then medians of ``repeats`` later ones, in turns."""
     spent([["run", str(SCENES / "cardan_atlas.toml"), "--out", str(folder / "atlas.nc")]], folder / "atlas cache")
-    turns = []
-    for turn in range(repeats + 1):
-        turns.append({name: spent(lines, folder / name) for name, lines in commands(folder, turn).items()})
+    turns = [
+        {name: spent(lines, folder / name) for name, lines in commands(folder, turn).items()}
+        for turn in range(repeats + 1)
+    ]
     rows = []
     for name, (aim, first_aim) in AIMS.items():
-        first, *later = (turn[name] for turn in turns)
-        rows.append(
-            {
-                "command": name,
-                "first_cpu_s": first.cpu,
-                "first_aim_s": first_aim or "",
-                "cpu_s": median([one.cpu for one in later]),
-                "aim_s": aim,
-                "wall_s": median([one.wall for one in later]),
-            }
-        )
+        (first, _), *later = (turn[name] for turn in turns)
+        cpu, wall = map(median, zip(*later, strict=True))
+        row = {"command": name, "first_cpu_s": first, "first_aim_s": first_aim or ""}
+        rows.append(row | {"cpu_s": cpu, "aim_s": aim, "wall_s": wall})
     return rows
 
 

@@ -6,7 +6,7 @@ import math
 import re
 import time
 import warnings
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,11 +36,11 @@ pytestmark = pytest.mark.docs
 
 
 def rung(setting="rtol=1e-9", error=1e-10, failed=0, noticed="", **changed):
-    return replace(Rung("cardan", "easy", "method", setting, error, 1e-5, 0.0, 8, failed, noticed), **changed)
+    return Rung("cardan", "easy", "method", setting, error, 1e-5, 0.0, 8, failed, noticed)._replace(**changed)
 
 
 def write(folder, name, rows, notes=()):
-    write_csv(folder / f"{name}.csv", [asdict(row) if isinstance(row, Rung) else row for row in rows], notes)
+    write_csv(folder / f"{name}.csv", [row._asdict() if isinstance(row, Rung) else row for row in rows], notes)
 
 
 def test_the_page_is_what_the_stored_files_give():
@@ -59,7 +59,7 @@ def test_an_accelerator_is_measured_or_there_was_none(tmp_path, monkeypatch):
     assert line["difference"] == pytest.approx(1e-9, rel=1e-6) and line["first_s"] == 4.0
     write(tmp_path, "accelerator", [line], ["ACME 1; warm"])
     text = page.text_of(tmp_path, tmp_path / "benchmarks.md")
-    assert all(told in text for told in ("ACME 1", "cardan, chart 9,000 ", page.against(3, "")))
+    assert "ACME 1" in text and "| cardan, chart | 900 | 3,000 | 9,000 | 3 |" in text
     monkeypatch.setenv("JAX_PLATFORMS", "")
     with pytest.raises(SystemExit, match="jax finds none"):
         accelerator.measure(tmp_path, quick=True)
@@ -90,17 +90,14 @@ def test_comparisons_with_the_best_rival(tmp_path):
     assert all((tmp_path / f"{name}.png").stat().st_size > 10_000 for name in ("ratios", "precision_cardan"))
 
 
-def test_files_of_several_commits_or_of_a_loaded_machine_are_named(tmp_path):
+def test_every_file_has_its_commit_and_the_load_of_its_machine(tmp_path):
     def store(name, commit, cores):
         head = f"# commit: {commit}\n# load: {cores} cores by other programs\n"
         (tmp_path / f"{name}.csv").write_text(head + "a\n1\n")
 
-    for name, cores in (("a", 0.1), ("b", 0.4)):
-        store(name, "1", cores)
-    assert page.warnings(tmp_path) == []
+    store("a", "1", 0.1)
     store("b", "2", 0.8)
-    several, loaded = page.warnings(tmp_path)
-    assert "2 (b)" in several and "b (0.8)" in loaded and "a (" not in loaded
+    assert page.measurements(tmp_path).splitlines()[2:] == ["| a |  | 1 |  | 0.1 |", "| b |  | 2 |  | 0.8 |"]
 
 
 def test_results_name_their_commit_and_the_load_by_others():
@@ -112,12 +109,12 @@ def test_results_name_their_commit_and_the_load_by_others():
 def test_a_page_without_any_file_says_so(tmp_path):
     text = page.text_of(tmp_path, tmp_path / "benchmarks.md")
     assert all(page.not_measured(f"precision_{system}") in text for system in page.TITLES)
-    assert "No GPU was available" in text and "times as fast" not in text
+    assert page.not_measured("accelerator") in text and "times as fast" not in text
 
 
 def test_the_page_is_short_and_shows_how_many_cells_every_method_computed():
     text = page.PAGE.read_text()
-    assert len(text) < 15_000 and text.index("| comparison |") < 500
+    assert len(text) < 16_000 and text.index("| comparison |") < 500
     assert "| scipy RK45, rtol=1e-09 | 200 | " in text and "Omega from 0.1 to 2" in text
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import drivetrain_jax as dt
-from benchmarks.validation.document import Page, inventory, markdown
+from benchmarks.validation.document import Page, inventory, section, table
 from drivetrain_jax.systems.bicardan import PRESETS
 from tests.oracles.bicardan_reference import determinant_roots, finite_elements
 
@@ -56,25 +56,21 @@ def section_four() -> str:
             exact["rhoA"] = (7800 * 19.6e-4,) * 3
         ours, with_exact, fem = frequencies(fitted), frequencies(exact), finite_elements(fitted, 2)
         for mode in (0, 1):
-            rows.append([f"{name}, p{mode + 1}", f"{printed[mode]:.2f}", f"{ours[mode]:.3f}", f"{fem[mode]:.3f}"])
-            rows[-1] += [f"{with_exact[mode]:.3f}", f"{100 * (ours[mode] / printed[mode] - 1):+.3f} %"]
+            values = f"{printed[mode]:.2f} | {ours[mode]:.3f} | {fem[mode]:.3f} | {with_exact[mode]:.3f}"
+            rows.append(f"{name}, p{mode + 1} | {values} | {100 * (ours[mode] / printed[mode] - 1):+.3f} %")
             n, n_314 = ours[mode] * 30 / math.pi, ours[mode] * 30 / 3.14
-            speeds.append([f"{name}, n{mode + 1}", f"{printed_n[mode]:.2f}", f"{n:.2f}", f"{n_314:.2f}"])
-    head = ("case [rad/s]", "printed", "ours", "independent", "ours, exact I", "ours over printed")
-    table = markdown(head, rows)
-    second = markdown(("case [rpm]", "printed", "ours, 30 p/pi", "ours, 30 p/3.14"), speeds)
-    return f"""## Section 4: pulsations and critical speeds
-
-The paper does not print E and I. These values reproduce its results: E = 2.1e11 N/m2, rho = 7800 kg/m3,
+            speeds.append(f"{name}, n{mode + 1} | {printed_n[mode]:.2f} | {n:.2f} | {n_314:.2f}")
+    text = """The paper does not print E and I. These values reproduce its results: E = 2.1e11 N/m2, rho = 7800 kg/m3,
 I = 3.06e-7, 1.055e-7, 3.97e-8 m4, the printed areas, and uniform bars of 3 x 0.30 = 0.90 m (not 0.91). A2 = 3.6e-4 m2 is
 not the area of the 50/45 tube, 3.7306e-4. The solid bar has the exact area, 19.635e-4 m2; the first segment of the shaft
 has the printed one, 19.6e-4. "Independent": finite elements of high degree (tests/oracles/bicardan_reference.py). "Exact
-I": moments of the diameters 50, 50/45, 30 mm with the printed areas.
-
-{table}
-The paper computes critical speeds with 3.14 for pi, so they are 0.05 % too high:
-
-{second}"""
+I": moments of the diameters 50, 50/45, 30 mm with the printed areas."""
+    head = "case [rad/s] | printed | ours | independent | ours, exact I | ours over printed"
+    second = table("case [rpm] | printed | ours, 30 p/pi | ours, 30 p/3.14", speeds)
+    return (
+        f"{section('Section 4: pulsations and critical speeds', text, head, rows)}\n"
+        f"The paper computes critical speeds with 3.14 for pi, so they are 0.05 % too high:\n\n{second}"
+    )
 
 
 def _rule_31() -> float:
@@ -87,11 +83,11 @@ def formula_31() -> str:
     rule = _rule_31()
     ours = float(solve(PRESETS["paper_fitted"], ("critical_speed",), modes=1).critical_speed[0])
     rows = [
-        ["n of (31), D = 5, d = 4.5, L = 91 cm", "", f"{rule:.2f}", ""],
-        ["excess over the printed n1 = 8375.78", "17 %", f"{100 * (rule / 8375.78 - 1):.2f} %", ""],
-        ["excess over the computed n1", "", f"{100 * (rule / ours - 1):.2f} %", "(31) is a uniform pinned tube"],
+        f"n of (31), D = 5, d = 4.5, L = 91 cm |  | {rule:.2f} | ",
+        f"excess over the printed n1 = 8375.78 | 17 % | {100 * (rule / 8375.78 - 1):.2f} % | ",
+        f"excess over the computed n1 |  | {100 * (rule / ours - 1):.2f} % | (31) is a uniform pinned tube",
     ]
-    return f"## Conclusion 1: formula (31)\n\n{markdown(('quantity', 'printed', 'ours', 'why'), rows)}"
+    return section("Conclusion 1: formula (31)", "", "quantity | printed | ours | why", rows)
 
 
 def influences() -> dict[str, str]:
@@ -131,29 +127,16 @@ def _thicker(factor: float) -> Parameters:
 def conclusions(found: Mapping[str, str]) -> str:
     """Conclusions 2 to 5."""
     rows = [
-        ["2", "the program determines the influence of the supports", f"rigid A: n1 {found['rigid']}", "yes"],
-        [
-            "3",
-            "k_D 20e6 to 85e6: amplitudes at the characteristic points fall, in mode 1 four times at D (f_A = 1)",
-            f"at B, C, D {found['drops']}",
-            "yes",
-        ],
-        ["3", "critical speeds fall with k_D (20e6 to 2e6)", f"n1 {found['softer']}", "yes"],
-        [
-            "4",
-            "n1 low and n2 high is wanted",
-            f"n2/n1 = {found['ratio']}",
-            "a wish; n1 above the service range is usual",
-        ],
-        [
-            "5",
-            "a shorter shaft raises n2 (here 0.9 of all lengths)",
-            f"n2 {found['short']}",
-            "yes; less than 1/0.81, because the supports stay",
-        ],
-        ["5", "a larger outer diameter raises n2 (here 1.1 of it)", f"n2 {found['thick']}", "yes"],
+        f"2 | the program determines the influence of the supports | rigid A: n1 {found['rigid']} | yes",
+        "3 | k_D 20e6 to 85e6: amplitudes at the characteristic points fall, in mode 1 four times at D (f_A = 1) | "
+        f"at B, C, D {found['drops']} | yes",
+        f"3 | critical speeds fall with k_D (20e6 to 2e6) | n1 {found['softer']} | yes",
+        f"4 | n1 low and n2 high is wanted | n2/n1 = {found['ratio']} | a wish; n1 above the service range is usual",
+        f"5 | a shorter shaft raises n2 (here 0.9 of all lengths) | n2 {found['short']} | yes; less than 1/0.81, because "
+        "the supports stay",
+        f"5 | a larger outer diameter raises n2 (here 1.1 of it) | n2 {found['thick']} | yes",
     ]
-    return f"## Conclusions 2 to 5\n\n{markdown(('no.', 'the paper', 'ours', 'holds'), rows)}"
+    return section("Conclusions 2 to 5", "", "no. | the paper | ours | holds", rows)
 
 
 def everything(found: Mapping[str, str]) -> str:
@@ -166,14 +149,10 @@ def everything(found: Mapping[str, str]) -> str:
     shaft = PRESETS["paper"]
     fem = np.abs(finite_elements(shaft, 8, bubbles=24) / frequencies(shaft, 8) - 1).max()
     return inventory(
-        "bicardan",
-        fem=f"{fem:.0e}",
-        wrong=f"{printed_row_of_seven(PRESETS['paper_fitted']):.1f}",
-        right=f"{frequencies(PRESETS['paper_fitted'], 1)[0]:.1f}",
-        excess=f"{100 * (_rule_31() / 8375.78 - 1):.2f} %",
-        **printed,
-        **found,
-    )
+        "bicardan", fem=f"{fem:.0e}", wrong=f"{printed_row_of_seven(PRESETS['paper_fitted']):.1f}",
+        right=f"{frequencies(PRESETS['paper_fitted'], 1)[0]:.1f}", excess=f"{100 * (_rule_31() / 8375.78 - 1):.2f} %",
+        **printed, **found,
+    )  # fmt: skip
 
 
 def printed_row_of_seven(parameters: Parameters) -> float:
@@ -205,13 +184,13 @@ def printed_errors() -> str:
         wrong, right = printed_row_of_seven(shaft), float(frequencies(shaft, 1)[0])
         effects.append(f"{wrong:.1f} instead of {right:.1f} ({name})")
     rows = [
-        ["(7), last row", "[f4 f3 f2 f1]", "[f2 f3 f4 f1]", f"three segments, p1 = {', '.join(effects)}"],
-        ["(4)", "f_A = F(0), f_B = F(l)", "f(0), f(l)", "F is the shear force"],
-        ["(25)", "a matrix", "its determinant", ""],
-        ["(26)", "theta_A = -R32/R31", "-k_A R32/R31", "dimension: F_A = k_A for f_A = 1"],
-        ["(30)", "[alpha3] F [alpha3]", "[alpha3]^-1 F [alpha3]", "as in (28)"],
+        f"(7), last row | [f4 f3 f2 f1] | [f2 f3 f4 f1] | three segments, p1 = {', '.join(effects)}",
+        "(4) | f_A = F(0), f_B = F(l) | f(0), f(l) | F is the shear force",
+        "(25) | a matrix | its determinant | ",
+        "(26) | theta_A = -R32/R31 | -k_A R32/R31 | dimension: F_A = k_A for f_A = 1",
+        "(30) | [alpha3] F [alpha3] | [alpha3]^-1 F [alpha3] | as in (28)",
     ]
-    return f"## Printing errors\n\n{markdown(('place', 'printed', 'right', 'evidence'), rows)}"
+    return section("Printing errors", "", "place | printed | right | evidence", rows)
 
 
 def numerics() -> str:
@@ -221,31 +200,18 @@ def numerics() -> str:
     plain = solve(shaft, ("angular_frequency", "count_certified"), method="krylov_determinant", modes=14)
     scan = determinant_roots(shaft, 14)
     fem = finite_elements(shaft, 14, bubbles=24)
+    values, certified = plain.angular_frequency.values, plain.count_certified.values
     rows = [
-        [
-            str(mode + 1),
-            f"{ours[mode]:.6f}",
-            f"{abs(fem[mode] / ours[mode] - 1):.0e}",
-            f"{abs(plain.angular_frequency.values[mode] / ours[mode] - 1):.0e}",
-            f"{abs(scan[mode] / ours[mode] - 1):.0e}",
-            "yes" if plain.count_certified.values[mode] else "no",
-        ]
+        f"{mode + 1} | {ours[mode]:.6f} | "
+        + " | ".join(f"{abs(other[mode] / ours[mode] - 1):.0e}" for other in (fem, values, scan))
+        + f" | {'yes' if certified[mode] else 'no'}"
         for mode in (0, 3, 6, 8, 9, 10, 11, 12, 13)
     ]
-    head = (
-        "mode",
-        "certified p [rad/s]",
-        "finite elements",
-        "krylov_determinant",
-        "NumPy, Brent",
-        "certified by the count",
-    )
-    return f"""## Range of the plain determinant
-
+    head = "mode | certified p [rad/s] | finite elements | krylov_determinant | NumPy, Brent | certified by the count"
+    text = """\
 Relative differences from the certified method, for the shaft of three segments with exact I. Cancellation in the
-determinant grows like exp(tau), where tau is the sum of all phases. Near mode 12 no digit is left, and the count fails.
-
-{markdown(head, rows)}"""
+determinant grows like exp(tau), where tau is the sum of all phases. Near mode 12 no digit is left, and the count fails."""
+    return section("Range of the plain determinant", text, head, rows)
 
 
 def additions() -> str:
@@ -268,14 +234,12 @@ def additions() -> str:
             named = ", ".join(part for part in (support, name) if part)
             rows.append([named, *(f"{x:.4f}" for x in ours), f"{np.abs(fem / ours - 1).max():.0e}"])
             rows[-1] += [f"{100 * (a / b - 1):+.2f} %" for a, b in zip(ours, plain, strict=True)]
-    head = ("tube 50/45, 3 x 0.30 m, with", "p1", "p2", "finite elements differ by", "p1", "p2")
-    return f"""## Beyond the paper
-
+    head = "tube 50/45, 3 x 0.30 m, with | p1 | p2 | finite elements differ by | p1 | p2"
+    text = """\
 The last two columns compare with the plain tube on the same supports. Shear (0.53 G A, G = 8.1e10 N/m2) and rotary
 inertia lower p2 by 3.3 % on the paper's supports. On stiff supports (1e12 N/m), where the shaft itself deforms more,
-they lower it by 3.9 %.
-
-{markdown(head, rows)}"""
+they lower it by 3.9 %."""
+    return section("Beyond the paper", text, head, rows)
 
 
 def page(full: bool) -> Page:

@@ -9,7 +9,7 @@ import numpy as np
 
 import drivetrain_jax as dt
 from benchmarks.validation.cardan_conclusions import found, orbit_section
-from benchmarks.validation.document import Page, inventory, markdown
+from benchmarks.validation.document import Page, inventory, section
 from tests.oracles.cardan_orbit_reference import linear_response, nonlinear_orbit
 from tests.oracles.cardan_paper import (
     PRINTED_FREQUENCIES,
@@ -27,6 +27,8 @@ from tests.oracles.cardan_reference import (
     spectral_radius,
     stacked_monodromy,
 )
+
+HEAD = " | published | ours | independent | why they differ"
 
 
 def package_chart(outputs: Sequence[str], **fixed: float) -> Any:
@@ -50,37 +52,24 @@ def frequencies_section() -> str:
     from drivetrain_jax import resonances
 
     exact, independent = resonances.natural_frequencies(1.0, 100.0), natural_frequencies()
+    why = "the paper's own (25) does not give its (26)"
     rows = [
-        [
-            f"omega{i + 1}",
-            f"{printed:.3f}",
-            f"{exact[i]:.12f}",
-            f"{independent[i]:.12f}",
-            "the paper's own (25) does not give its (26)",
-        ]
+        f"omega{i + 1} | {printed:.3f} | {exact[i]:.12f} | {independent[i]:.12f} | " + why
         for i, printed in enumerate(PRINTED_FREQUENCIES)
     ]
     ours, rounded = predicted_speeds(exact), predicted_speeds(PRINTED_FREQUENCIES)
     speeds = [
-        [
-            name,
-            f"{printed:.3f}",
-            f"{ours[name]:.6f}",
-            f"{rounded[name]:.4f}",
-            _speed_reason(printed, rounded[name], ours[name]),
-        ]
+        f"{name} | {printed:.3f} | {ours[name]:.6f} | {rounded[name]:.4f} | "
+        + _speed_reason(printed, rounded[name], ours[name])
         for name, printed in PRINTED_SPEEDS.items()
     ]
-    return "\n".join(
-        [
-            "## Natural frequencies, eqs (25)-(26)\n",
-            markdown(
-                ["", "published", "ours", "independent: eigenvalues of the stiffness matrix", "why they differ"], rows
-            ),
-            "\n## Tables 1 and 2: predicted resonance speeds\n",
-            markdown(["", "published", "ours", "from the printed 0.072 and 1.422", "why they differ"], speeds),
-        ]
-    )
+    head = " | published | ours | {} | why they differ"
+    independent = head.format("independent: eigenvalues of the stiffness matrix")
+    predicted = head.format("from the printed 0.072 and 1.422")
+    return "\n".join([
+        section("Natural frequencies, eqs (25)-(26)", "", independent, rows),
+        section("Tables 1 and 2: predicted resonance speeds", "", predicted, speeds),
+    ])  # fmt: skip
 
 
 def _speed_reason(printed: float, from_printed: float, exact: float) -> str:
@@ -104,98 +93,62 @@ def equations_section(stride: int) -> str:
     cells = base_chart(stride)["beta"].size
     fraction, dropped = unstable_fraction(damping_and_stiffness, stride)
     printed, sign_only = (unstable_fraction(printed_matrices(sign), stride)[0] for sign in (1.0, -1.0))
-    impossible = "unstable almost everywhere, against Figs 2-3, so the authors did not compute with (15)"
-    blank = "without eta'' and with eta' in place of 2 eta' the chart is empty"
-    clause = "share of the unstable cells that 'or Re(sigma) <= 0' calls stable"
-    share = f"{1 - kept.sum() / unstable.sum():.3f}"
-    origin = "linearisation of the paper's (1), (5), (6)"
+    share = 1 - kept.sum() / unstable.sum()
     rows = [
-        ["checked E and P", "-", f"{unstable.mean():.4f}", f"{fraction:.4f}", origin],
-        ["E and P as printed in (15)", "-", "-", f"{printed:.4f}", impossible],
-        ["only the sign of P21 corrected", "-", "-", f"{sign_only:.4f}", blank],
-        [
-            clause,
-            "-",
-            share,
-            f"{dropped:.3f}",
-            "a clause for exponents; the multipliers of every S tongue are negative",
-        ],
+        f"checked E and P | - | {unstable.mean():.4f} | {fraction:.4f} | linearisation of the paper's (1), (5), (6)",
+        f"E and P as printed in (15) | - | - | {printed:.4f} | unstable almost everywhere, against Figs 2-3, so the authors "
+        "did not compute with (15)",
+        f"only the sign of P21 corrected | - | - | {sign_only:.4f} | without eta'' and with eta' in place of 2 eta' the "
+        "chart is empty",
+        f"share of the unstable cells that 'or Re(sigma) <= 0' calls stable | - | {share:.3f} | {dropped:.3f} | a clause "
+        "for exponents; the multipliers of every S tongue are negative",
     ]
-    return "\n".join(
-        [
-            "## Equations and stability criterion\n",
-            "Unstable fraction of the base chart (zeta 0.001, alpha = mu = 1, gamma = 100; beta 0..1.5, "
-            f"Omega 0.01..2). Ours: 151 x 200 cells. Independent: {cells} of them by SciPy's DOP853 in the paper's own "
-            "coordinates.\n",
-            markdown(["", "published", "ours", "independent", "why they differ"], rows),
-        ]
+    text = (
+        "Unstable fraction of the base chart (zeta 0.001, alpha = mu = 1, gamma = 100; beta 0..1.5, Omega 0.01..2). Ours: "
+        f"151 x 200 cells. Independent: {cells} of them by SciPy's DOP853 in the paper's own coordinates."
     )
+    return section("Equations and stability criterion", text, HEAD, rows)
 
 
 def trends_section() -> str:
     """Statements of the paper about damping, stiffness and narrow tongues."""
+    from drivetrain_jax import resonances
+
     alpha20 = float((package_chart(["verdict"], alpha=20.0).verdict == 1).mean())
+    speeds = predicted_speeds(resonances.natural_frequencies(20.0, 100.0))
+    peaks = ", ".join(f"{speeds[name]:.3f}" for name in ("S21", "C+1", "H21"))
     rows = [
-        [
-            "Fig. 4, alpha = 20: unstable fraction",
-            '"slightly smaller"',
-            f"{alpha20:.4f}",
-            "",
-            "agree (base case: first table)",
-        ],
-        [
-            "Fig. 6, mu = 20: S21, C+1, H21",
-            "peaks above Omega = 2",
-            _speeds_mu20(),
-            "",
-            "agree; the text calls the figure's ratio a damping ratio",
-        ],
+        f'Fig. 4, alpha = 20: unstable fraction | "slightly smaller" | {alpha20:.4f} |  | agree (base case: first table)',
+        f"Fig. 6, mu = 20: S21, C+1, H21 | peaks above Omega = 2 | {peaks} |  | agree; the text calls the figure's ratio a "
+        "damping ratio",
         *_destabilising_rows(),
         _narrow_tongue_row(),
     ]
-    return "## Trends\n\n" + markdown(["", "published", "ours", "independent", "why they differ"], rows)
+    return section("Trends", "", HEAD, rows)
 
 
-def _speeds_mu20() -> str:
-    from drivetrain_jax import resonances
-
-    speeds = predicted_speeds(resonances.natural_frequencies(20.0, 100.0))
-    return ", ".join(f"{speeds[name]:.3f}" for name in ("S21", "C+1", "H21"))
-
-
-def _destabilising_rows() -> list[list[str]]:
+def _destabilising_rows() -> list[str]:
     zetas = [0.0, 0.001, 0.01]
     points = {"beta": [1.14] * 3, "Omega": [0.6695] * 3, "zeta": zetas}
     ds = package_points("floquet", ["spectral_radius", "verdict"], points)
     names = ds.verdict.attrs["flag_meanings"].split()
     rows = []
-    for i, zeta in enumerate(zetas):
-        rho, verdict = float(ds.spectral_radius[i]), names[int(ds.verdict[i])]
+    for zeta, rho, code in zip(zetas, ds.spectral_radius.values, ds.verdict.values, strict=True):
         independent = spectral_radius(monodromy(BASE_CASE | {"beta": 1.14, "Omega": 0.6695, "zeta": zeta}))
         why = "bounded without damping" if zeta == 0 else "damping destabilises here, against the paper's conclusion"
-        rows.append(
-            [
-                f"rho at (1.14, 0.6695), zeta = {zeta:g}",
-                '"damping stabilises"',
-                f"{rho:.10f}, {verdict}",
-                f"{independent:.10f}",
-                why,
-            ]
-        )
+        found = f"{rho:.10f}, {names[code]} | {independent:.10f}"
+        rows.append(f'rho at (1.14, 0.6695), zeta = {zeta:g} | "damping stabilises" | {found} | {why}')
     return rows
 
 
-def _narrow_tongue_row() -> list[str]:
+def _narrow_tongue_row() -> str:
     beta, omega = np.linspace(0.0225, 0.0255, 13), np.linspace(0.0706, 0.07065, 21)
-    grid = np.meshgrid(beta, omega, indexing="ij")
-    ds = package_points("floquet", ["verdict"], {"beta": grid[0].ravel(), "Omega": grid[1].ravel()})
-    found = f"{grid[0].ravel()[ds.verdict.values == 1].min():.5f}"
-    rho = spectral_radius(
-        stacked_monodromy({"beta": grid[0].ravel(), "Omega": grid[1].ravel(), **BASE_CASE}, 1e-11, 1e-11)
-    )
-    independent = f"{grid[0].ravel()[rho > 1].min():.5f}"
+    grid = [values.ravel() for values in np.meshgrid(beta, omega, indexing="ij")]
+    ds = package_points("floquet", ["verdict"], {"beta": grid[0], "Omega": grid[1]})
+    rho = spectral_radius(stacked_monodromy({"beta": grid[0], "Omega": grid[1], **BASE_CASE}, 1e-11, 1e-11))
+    found = " | ".join(f"{grid[0][unstable].min():.5f}" for unstable in (ds.verdict.values == 1, rho > 1))
     why = "the paper's spacing of 0.01 steps over the tip; grid here: 0.00025 x 2.5e-6"
-    return ["smallest unstable beta of the tongue S11", "not visible", found, independent, why]
+    return f"smallest unstable beta of the tongue S11 | not visible | {found} | {why}"
 
 
 def forced_section() -> str:
@@ -213,23 +166,18 @@ def forced_section() -> str:
         linear, (_, amplitude, rho) = linear_response(p)[1], nonlinear_orbit(p, near)
         at = f"({beta:g}, {omega:g})"
         rows += [
-            [f"{at} rho about theta = 0", f"{about_zero[i]:.8f}", f"{spectral_radius(monodromy(p)):.8f}"],
-            [f"{at} nonlinear orbits found", f"{int(ours.orbit_count[i])}", ""],
-            [f"{at} rho about the nonlinear orbit", f"{float(ours.orbit_spectral_radius[i]):.8f}", f"{rho:.8f}"],
-            [f"{at} linear amplitudes / rad", _pair(ours.amplitude[i].values), _pair(linear)],
-            [f"{at} amplitudes of the orbit / rad", _pair(ours.orbit_amplitude[i].values), _pair(amplitude)],
+            f"{at} rho about theta = 0 | {about_zero[i]:.8f} | {spectral_radius(monodromy(p)):.8f}",
+            f"{at} nonlinear orbits found | {int(ours.orbit_count[i])} | ",
+            f"{at} rho about the nonlinear orbit | {float(ours.orbit_spectral_radius[i]):.8f} | {rho:.8f}",
+            f"{at} linear amplitudes / rad | {_pair(ours.amplitude[i].values)} | {_pair(linear)}",
+            f"{at} amplitudes of the orbit / rad | {_pair(ours.orbit_amplitude[i].values)} | {_pair(amplitude)}",
         ]
     text = (
         "The paper keeps the forcing (0, -eta')^T in (15), but judges stability by the homogeneous part, about "
         "theta = 0. The shaft moves along a forced periodic orbit instead. Where several orbits coexist, the values are "
-        "those of the smallest stable one, or of the smallest one if none is stable. The paper publishes no values here.\n"
+        "those of the smallest stable one, or of the smallest one if none is stable. The paper publishes no values here."
     )
-    return (
-        "## Forced response and the true orbit\n\n"
-        + text
-        + "\n"
-        + markdown(["", "ours", "independent (SciPy shooting)"], rows)
-    )
+    return section("Forced response and the true orbit", text, " | ours | independent (SciPy shooting)", rows)
 
 
 def _pair(values: Sequence[float]) -> str:
@@ -242,12 +190,6 @@ def page(full: bool) -> Page:
         "Validation of the cardan shaft",
         "Soltan Rezaee & Ghazavi 2014 against this package; the corrected equations are derived in "
         "[theory/cardan.md](../theory/cardan.md).",
-        (
-            frequencies_section(),
-            equations_section(1 if full else 2),
-            trends_section(),
-            forced_section(),
-            orbit_section(),
-            inventory("cardan", **found()),
-        ),
-    )
+        (frequencies_section(), equations_section(1 if full else 2), trends_section(), forced_section(), orbit_section(),
+         inventory("cardan", **found())),
+    )  # fmt: skip

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import drivetrain_jax as dt
-from benchmarks.validation.document import markdown
+from benchmarks.validation.document import section
 from drivetrain_jax.atlas.tips import find_tips
 from tests.oracles.cardan_paper import natural_frequencies, predicted_speeds, printed_matrices, unstable_fraction
 from tests.oracles.cardan_reference import BASE_CASE, spectral_radius, stacked_monodromy
@@ -57,20 +57,20 @@ def orbit_section() -> str:
     moves, still = (orbit.orbit_spectral_radius > 1).values & known, (rest.verdict == 1).values & known
     largest = np.degrees(orbit.orbit_amplitude.max("shaft").where(~still).max(("beta", "Omega")))
     rows = [
-        ["cells, of these computed", f"{known.size}, {known.sum()}"],
-        ["unstable about rest", f"{still.sum()}"],
-        ["several orbits found", f"{(orbit.orbit_count > 1).values.sum()}"],
-        ["no stable orbit found", f"{moves.sum()}"],
-        ["stable about rest, no stable orbit found", f"{(moves & ~still).sum()}"],
-        ["unstable about rest, a stable orbit found", f"{(~moves & still).sum()}"],
-        ["largest twist of the reported orbit in a cell that is stable about rest", f"{float(largest):.1f} degrees"],
+        f"cells, of these computed | {known.size}, {known.sum()}",
+        f"unstable about rest | {still.sum()}",
+        f"several orbits found | {(orbit.orbit_count > 1).values.sum()}",
+        f"no stable orbit found | {moves.sum()}",
+        f"stable about rest, no stable orbit found | {(moves & ~still).sum()}",
+        f"unstable about rest, a stable orbit found | {(~moves & still).sum()}",
+        f"largest twist of the reported orbit in a cell that is stable about rest | {float(largest):.1f} degrees",
     ]
     text = (
         "`cardan_orbit_chart`, base case. The paper judges rest alone; the shaft twists by tens of degrees at speeds that "
         "rest calls stable. Near the speeds $\\omega_2/2k$ several orbits of the same period coexist. The reported orbit is "
-        "the smallest stable one; the shaft may move along a larger one instead ([theory](../theory/cardan.md)).\n"
+        "the smallest stable one; the shaft may move along a larger one instead ([theory](../theory/cardan.md))."
     )
-    return f"## Chart of the forced orbit\n\n{text}\n" + markdown(["", "ours"], rows)
+    return section("Chart of the forced orbit", text, " | ours", rows)
 
 
 def _unstable(scene: str) -> Any:

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
-from benchmarks.measure import provenance
+from benchmarks.measure import Line, markdown, provenance
 
 FOLDER = Path(__file__).parents[2] / "docs" / "validation"
-Rows = Sequence[Sequence[str]]
 
 
-@dataclass(frozen=True)
-class Page:
+class Page(NamedTuple):
     """The validation page of one system: ``title``, ``introduction`` and ``sections`` in Markdown."""
 
     title: str
@@ -26,15 +24,18 @@ class Page:
         head = f"# {self.title}\n\n{self.introduction} Written by `{command}`; do not edit.\n"
         facts = provenance()
         path = FOLDER / f"{system}.md"
-        FOLDER.mkdir(parents=True, exist_ok=True)
         path.write_text("\n".join([head, *self.sections, f"{facts['machine']}; {facts['versions']}.\n"]))
         return path
 
 
-def markdown(head: Sequence[str], rows: Rows) -> str:
-    """A Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+def section(title: str, text: str, head: Line, rows: Sequence[Line]) -> str:
+    """A section with an optional text above its table."""
+    return "\n\n".join(filter(None, (f"## {title}", text, table(head, rows))))
+
+
+def table(head: Line, rows: Sequence[Line]) -> str:
+    """A Markdown table that ends with a newline."""
+    return markdown(head, rows) + "\n"
 
 
 def inventory(system: str, **found: str) -> str:
@@ -43,7 +44,7 @@ def inventory(system: str, **found: str) -> str:
     A line has five cells; ``{name}`` is replaced by a value of ``found``, which is computed for the page.
     """
     lines = (Path(__file__).parent / "inventory" / f"{system}.txt").read_text().splitlines()
-    rows = [[cell.strip().format(**found) for cell in line.split(" | ")] for line in lines]
-    head = ("place", "where it is computed", "the paper", "ours", "agreement, or the reason")
-    text = "Files without a folder of their own stand in `drivetrain_jax/`.\n"
-    return f"## Every equation, figure, table and conclusion\n\n{text}\n{markdown(head, rows)}"
+    head = "place | where it is computed | the paper | ours | agreement, or the reason"
+    text = "Files without a folder of their own stand in `drivetrain_jax/`."
+    rows = [line.strip().format(**found) for line in lines]
+    return section("Every equation, figure, table and conclusion", text, head, rows)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import drivetrain_jax as dt
-from benchmarks.validation.document import Page, markdown
+from benchmarks.validation.document import Page, section
 from tests.oracles import driveline_reference as oracle
 
 REFERENCE = Path(__file__).parents[2] / "tests" / "reference" / "driveline.json"
@@ -66,10 +66,10 @@ def makers() -> str:
         "Makers of shafts add squares of angles, with signs by the position of the forks, to the angle of one equivalent "
         "joint, and limit its unevenness U = 1/cos(beta) - cos(beta) to 0.0027. The rule is the limit of small angles of "
         "eq. (8), ln sec(beta) = |sum of +- ln sec(beta_j)|, which holds for all angles. It is 0.002 degrees low at 5 and "
-        "4 degrees, and half a degree low at 30 and 20.\n"
+        "4 degrees, and half a degree low at 30 and 20."
     )
-    head = ["angles in degrees", "rule", "computed angle", "U, printed", "U, computed", "U, by definition"]
-    return f"## Resulting angle and unevenness\n\n{text}\n{markdown(head, rows)}"
+    head = "angles in degrees | rule | computed angle | U, printed | U, computed | U, by definition"
+    return section("Resulting angle and unevenness", text, head, rows)
 
 
 def double_joint() -> str:
@@ -78,15 +78,15 @@ def double_joint() -> str:
     for degrees in ((30, 30), (30, 25)):
         for error in (0, 5, 20, 90):
             last = 90 + error
-            rows.append([f"{degrees[0]} and {degrees[1]}", str(error), f"{variation(degrees, last):.3e}",
-                         f"{extremes(degrees, last):.3e}"])  # fmt: skip
+            found = f"{variation(degrees, last):.3e} | {extremes(degrees, last):.3e}"
+            rows.append(f"{degrees[0]} and {degrees[1]} | {error} | {found}")
     text = (
         "Fischer & Paul 1991: a double joint turns its output uniformly if and only if its angles are equal and its "
         "relative phase is 0, which is a phase of 90 degrees here; with unequal angles the variation is least there, and "
-        "not zero. All agree.\n"
+        "not zero. All agree."
     )
-    head = ["angles in degrees", "error of the phase in degrees", "variation, computed", "by definition"]
-    return f"## Uniform double joints\n\n{text}\n{markdown(head, rows)}"
+    head = "angles in degrees | error of the phase in degrees | variation, computed | by definition"
+    return section("Uniform double joints", text, head, rows)
 
 
 def half_critical_speed() -> str:
@@ -99,10 +99,10 @@ def half_critical_speed() -> str:
     rows = [[f"{first:.2f}", f"{first / 2:.2f}", f"{peak:.2f}", f"{peak / first:.4f}"]]
     text = (
         "Yao & DeSmidt 2021 report that a driveline with two joints is captured near half of its first torsional frequency. "
-        "Each joint excites the second order of the speed, so the twist by `forced` is largest there.\n"
+        "Each joint excites the second order of the speed, so the twist by `forced` is largest there."
     )
-    head = ["first frequency (rad/s)", "half of it", "speed of the largest twist", "ratio"]
-    return f"## Half critical speed\n\n{text}\n{markdown(head, rows)}"
+    head = "first frequency (rad/s) | half of it | speed of the largest twist | ratio"
+    return section("Half critical speed", text, head, rows)
 
 
 def multipliers() -> str:
@@ -123,10 +123,10 @@ def multipliers() -> str:
     text = (
         "Spectral radii of eq. (A), and the largest distance of a multiplier from values in 80 bits and "
         "from SciPy's solution of equations with Lagrange multipliers, in which the pins of a joint are perpendicular in "
-        "space and no ratio of speeds is used. No published chart of a driveline with several joints has numbers.\n"
+        "space and no ratio of speeds is used. No published chart of a driveline with several joints has numbers."
     )
-    head = ["chain", "inertias", "joints", "computed", "80 bits", "distance", "distance from Lagrange multipliers"]
-    return f"## Floquet multipliers\n\n{text}\n{markdown(head, rows)}"
+    head = "chain | inertias | joints | computed | 80 bits | distance | distance from Lagrange multipliers"
+    return section("Floquet multipliers", text, head, rows)
 
 
 def page(full: bool) -> Page:

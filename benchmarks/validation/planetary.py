@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import drivetrain_jax as dt
-from benchmarks.validation.document import Page, inventory, markdown
+from benchmarks.validation.document import Page, inventory, section, table
 from tests.oracles.planetary_reference import TABLE_2, exact_frequencies, matrices
 
 # The paper divides by 2 x 3.14 instead of 2 pi, and cuts after the first decimal.
@@ -45,6 +45,8 @@ TABLE_6_UNEQUAL = (0.0, 1568.1, 2007.8, 2615.4, 8070.5, 14260.8)
 TABLE_7_PAIRS = (713.3, 739.0, 988.2, 1085.5, 1085.5, 1809.0, 1839.3, 1859.6, 1937.0, 1937.0)
 TABLE_7_EQUAL = (743.5, 743.5, 1002.0, 1102.9, 1102.9, 1845.9, 1896.9, 1896.9, 2277.5, 2277.5)
 HEAD = ["mode", "type", "computed", "independent, 50 digits", "printed", "computed x pi/3.14", "difference"]
+# Of frequencies that the paper quotes from its reference [4].
+QUOTED = [*HEAD[:5], "computed (quoted with the true pi)", HEAD[6]]
 
 
 def gear(degrees: Sequence[float], **fixed: float) -> Any:
@@ -98,9 +100,9 @@ def table_1() -> str:
     text = (
         "Section 4 of the paper compares its planets in pairs with the equally spaced ones of Lin & Parker, by the modes "
         'that both have. It reports errors of "0.04 %". The factor is pi/3.14 = 1.000507: the frequencies were divided by '
-        "2 x 3.14, and truncated after one decimal. Computed values times pi/3.14, truncated, give every entry.\n"
+        "2 x 3.14, and truncated after one decimal. Computed values times pi/3.14, truncated, give every entry."
     )
-    return f"## Table 1: four planets at 0, 80, 180, 260 degrees (Hz)\n\n{text}\n{markdown(HEAD, rows)}"
+    return section("Table 1: four planets at 0, 80, 180, 260 degrees (Hz)", text, HEAD, rows)
 
 
 def table_3() -> str:
@@ -111,31 +113,27 @@ def table_3() -> str:
     printed = {"rotational": rotational, "planet": planets, "translational": TABLE_3}
     text = (
         "Here sum exp(i psi) = 0, but sum exp(2 i psi) is not zero. The translational pairs split and all other "
-        "modes stay, as the paper says.\n"
+        "modes stay, as the paper says."
     )
-    unequal = markdown(HEAD, _by_kind(ds, exact, printed, PRINTED_PI))
+    title = "Table 3: four planets at 0, 80, 180, 260 degrees (Hz)"
+    unequal = section(title, text, HEAD, _by_kind(ds, exact, printed, PRINTED_PI))
     degrees = (0, 90, 180, 270)
-    equal = markdown(HEAD, _by_kind(gear(degrees), oracle(degrees), TABLE_3_EQUAL, 1.0))
-    equal = equal.replace("computed x pi/3.14", "computed (quoted with the true pi)")
-    title = "## Table 3: four planets at 0, 80, 180, 260 degrees (Hz)"
-    return f"{title}\n\n{text}\n{unequal}\nThe translational doublets of equal spacing:\n\n{equal}"
+    equal = table(QUOTED, _by_kind(gear(degrees), oracle(degrees), TABLE_3_EQUAL, 1.0))
+    return f"{unequal}\nThe translational doublets of equal spacing:\n\n{equal}"
 
 
 def table_4() -> str:
     """Six planets in opposite pairs."""
-    ds, exact = gear(SIX), oracle(SIX)
-    return "## Table 4: six planets at 0, 80, 120, 180, 260, 300 degrees (Hz)\n\n" + markdown(
-        HEAD, _by_kind(ds, exact, TABLE_4, PRINTED_PI)
-    )
+    rows = _by_kind(gear(SIX), oracle(SIX), TABLE_4, PRINTED_PI)
+    return section("Table 4: six planets at 0, 80, 120, 180, 260, 300 degrees (Hz)", "", HEAD, rows)
 
 
 def table_5() -> str:
     """Three planets."""
     degrees = (0, 120, 240)
     ds, exact = gear(degrees), oracle(degrees)
-    equal = markdown(HEAD, _by_kind(ds, exact, TABLE_5_EQUAL, 1.0))
-    equal = equal.replace("computed x pi/3.14", "computed (quoted with the true pi)")
-    own = markdown(HEAD, _by_kind(ds, exact, {"rotational": TABLE_5_UNEQUAL}, PRINTED_PI))
+    equal = section("Table 5: three planets (Hz)", "", QUOTED, _by_kind(ds, exact, TABLE_5_EQUAL, 1.0))
+    own = table(HEAD, _by_kind(ds, exact, {"rotational": TABLE_5_UNEQUAL}, PRINTED_PI))
     nearest = [f"{angle:.1f}" for angle in NEAREST_THREE]
     left = [_distance_of_unequal_three(NEAREST_THREE, 1.0), _distance_of_unequal_three((120, 240), PRINTED_PI)]
     text = (
@@ -145,7 +143,7 @@ def table_5() -> str:
         f"closest, with {left[1]:.1f} Hz (second table). Three planets have sum exp(i psi) = 0 only at equal spacing. Any "
         "unequal spacing couples rotation with translation, and the modes that the paper calls missing exist.\n"
     )
-    return f"## Table 5: three planets (Hz)\n\n{equal}\n{text}\n{own}"
+    return f"{equal}\n{text}\n{own}"
 
 
 def _distance_of_unequal_three(angles: Sequence[float], factor: float) -> float:
@@ -161,9 +159,8 @@ def table_6() -> str:
     """Five planets, and a counterexample to the paper's statement about odd numbers."""
     degrees = tuple(72 * i for i in range(5))
     ds, exact = gear(degrees), oracle(degrees)
-    equal = markdown(HEAD, _by_kind(ds, exact, TABLE_6_EQUAL, 1.0))
-    equal = equal.replace("computed x pi/3.14", "computed (quoted with the true pi)")
-    return f"## Table 6: five planets (Hz)\n\nEqually spaced:\n\n{equal}\n{_unequal_five()}\n{_balanced_five(ds)}"
+    equal = section("Table 6: five planets (Hz)", "Equally spaced:", QUOTED, _by_kind(ds, exact, TABLE_6_EQUAL, 1.0))
+    return f"{equal}\n{_unequal_five()}\n{_balanced_five(ds)}"
 
 
 def _unequal_five() -> str:
@@ -185,25 +182,19 @@ def _unequal_five() -> str:
         "and planet modes are coupled. The printed values agree within 1.1 Hz with equal spacing times pi/3.14. The "
         "table also lists the closest coupled modes.\n"
     )
-    return f"{text}\n{markdown(head, rows)}"
+    return f"{text}\n{table(head, rows)}"
 
 
 def _balanced_five(equal: Any) -> str:
     ds = gear(BALANCED_FIVE)
-    rows = [
-        [f"{a:.6f}", f"{b:.6f}"]
-        for a, b in zip(
-            ds.natural_frequency.values[kinds(ds) == "rotational"],
-            equal.natural_frequency.values[kinds(equal) == "rotational"],
-            strict=True,
-        )
-    ]
+    pair = (one.natural_frequency.values[kinds(one) == "rotational"] for one in (ds, equal))
     count = int((kinds(ds) == "translational").sum())
     text = (
         "At 0, 30, 120, 210, 240 degrees five unequally spaced planets are balanced. The rotational modes are those "
         f"of equal spacing, and {count} translational modes exist.\n"
     )
-    return f"{text}\n{markdown(['rotational, balanced unequal spacing', 'rotational, equal spacing'], rows)}"
+    rows = [f"{a:.6f} | {b:.6f}" for a, b in zip(*pair, strict=True)]
+    return f"{text}\n{table('rotational, balanced unequal spacing | rotational, equal spacing', rows)}"
 
 
 def table_7() -> str:
@@ -220,7 +211,7 @@ def table_7() -> str:
             [*_row(i + 1, types[i], frequency[i], exact[i], value), f"{stiff[i] * PRINTED_PI:.2f}"]
             for i, value in enumerate(printed)
         ]
-        parts.append(f"{title}:\n\n{markdown([*HEAD, 'with k_cu = 1e10, x pi/3.14'], rows)}")
+        parts.append(f"{title}:\n\n{table([*HEAD, 'with k_cu = 1e10, x pi/3.14'], rows)}")
     text = (
         "The text states k_cu = 1e10 N/m; the values belong to 1e9. The table of four planets lists 1085.5 twice; "
         "the second replaces 1095.3 of Table 3, the other half of the split pair. It lists 1937.0 twice, but only "
@@ -242,10 +233,10 @@ def rotational() -> str:
     text = (
         "Translations are held, and the carrier carries the centres of the planets. In distinct modes all bodies "
         "rotate, in degenerate ones the planets alone, N - 1 times at sqrt((k_sp + k_rp)/I_p)/(2 pi). The angles of "
-        'the planets have no influence. "Independent": NumPy, the plane gear under the constraint eta_n = u_c.\n'
+        'the planets have no influence. "Independent": NumPy, the plane gear under the constraint eta_n = u_c.'
     )
-    head = ["mode", "paper's type (ours)", "computed", "independent"]
-    return f"## Rotational model, (39) and (40): four planets (Hz)\n\n{text}\n{markdown(head, rows)}"
+    head = "mode | paper's type (ours) | computed | independent"
+    return section("Rotational model, (39) and (40): four planets (Hz)", text, head, rows)
 
 
 def _with_centres_held(angles: Sequence[float]) -> np.ndarray:
@@ -269,10 +260,10 @@ def dominant() -> str:
             rows.append([title, family, str(len(shares)), f"{min(shares):.2%}", f"{max(shares):.2%}"])
     text = (
         "A mode has a type if less than 1e-6 of it lies outside one family. Otherwise it is coupled, and "
-        "`dominant_family` with `dominant_share` says what it mostly is.\n"
+        "`dominant_family` with `dominant_share` says what it mostly is."
     )
-    head = ["gear", "dominant family of coupled modes", "modes", "least share", "largest share"]
-    return f"## Coupled modes by their dominant family\n\n{text}\n{markdown(head, rows)}"
+    head = "gear | dominant family of coupled modes | modes | least share | largest share"
+    return section("Coupled modes by their dominant family", text, head, rows)
 
 
 def _shares(degrees: Sequence[float]) -> dict[str, list[float]]:
@@ -293,13 +284,10 @@ def everything() -> str:
     kept = [np.isin(kinds(ds), ("rotational", "planet")) for ds in (equal, unequal)]
     pair = [ds.natural_frequency.values[own][1:] for ds, own in zip((equal, unequal), kept, strict=True)]
     return inventory(
-        "planetary",
-        distinct=", ".join(f"{f:.2f}" for f in np.abs(frequency[types < 2])),
-        degenerate=f"{frequency[types == 3][0]:.3f}",
-        times=str((types == 3).sum()),
-        three=str(len(_shares(THREE)["translational"])),
-        even=f"{np.abs(pair[0] / pair[1] - 1).max():.1g}",
-    )
+        "planetary", distinct=", ".join(f"{f:.2f}" for f in np.abs(frequency[types < 2])),
+        degenerate=f"{frequency[types == 3][0]:.3f}", times=str((types == 3).sum()),
+        three=str(len(_shares(THREE)["translational"])), even=f"{np.abs(pair[0] / pair[1] - 1).max():.1g}",
+    )  # fmt: skip
 
 
 def page(full: bool) -> Page:

@@ -14,7 +14,7 @@ from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 
 import drivetrain_jax as dt
-from benchmarks.validation.document import Page, inventory, markdown
+from benchmarks.validation.document import Page, inventory, section
 
 REFERENCE = json.loads((Path(__file__).parents[2] / "tests" / "reference" / "rattle.json").read_text())
 # Table 1 as printed: b = 10 deg.
@@ -81,10 +81,10 @@ def peak_section() -> str:
         "behind Fig. 2, so only the family of that curve can be reproduced. With R = 1 the frequency of the peak "
         "agrees with the exact one to 0.2 %, and the amplitude is 8 % too high. With the self-consistent range the "
         "amplitude is 15 % too high. Neither one-term method has the superharmonic peaks below .5, as the paper "
-        "says.\n"
+        "says."
     )
-    head = ["", "peak to peak at the peak", "its frequency", "lower fold", "upper fold", "independent"]
-    return f"## Peak and folds of Table 1\n\n{text}\n{markdown(head, rows)}"
+    head = " | peak to peak at the peak | its frequency | lower fold | upper fold | independent"
+    return section("Peak and folds of Table 1", text, head, rows)
 
 
 def _curve_cells(ds: xr.Dataset) -> list[str]:
@@ -124,12 +124,10 @@ def epsilon_section() -> str:
         "eps^2), but (18) gives B1^2 T^4/(4 eps^2 U^2). Equations (13), (51) and (52) are printed with lambda_1^2, "
         "but (9) and (10) define lambda_1. With these corrections epsilon cancels. If the scan shows U in place of "
         "that omega, epsilon also cancels, but a factor T is wrong. The table lists the amplitude a and the "
-        "frequency of the peak for the fit range R = 1.\n"
+        "frequency of the peak for the fit range R = 1."
     )
-    return (
-        "## The printed response equation\n\n" + text + "\n"
-        + markdown(["epsilon (Fig. 2: 0.01)", "as printed", "U for omega", "corrected"], rows)
-    )  # fmt: skip
+    head = "epsilon (Fig. 2: 0.01) | as printed | U for omega | corrected"
+    return section("The printed response equation", text, head, rows)
 
 
 def harmonics_section() -> str:
@@ -143,9 +141,9 @@ def harmonics_section() -> str:
         rows.append([str(count), *(f"{e:.1e}" for e in errors), f"{float(at.residual):.1e}"])
     text = (
         "Errors of u_max and u_min at omega = .7 compared with the exact motion, and rms residual of the equation "
-        "of motion.\n"
+        "of motion."
     )
-    return f"## Harmonics\n\n{text}\n{markdown(['harmonics', 'u_max', 'u_min', 'residual'], rows)}"
+    return section("Harmonics", text, "harmonics | u_max | u_min | residual", rows)
 
 
 GEARS = TABLE_1 | {"omega": 0.86, "u0": 0.5, "v0": 0.5}
@@ -184,11 +182,11 @@ def transient_section() -> tuple[str, dict[str, str]]:
     size = float(np.sqrt(np.mean(np.asarray(exact.u) ** 2)))
     text = (
         "From u = v = .5 at omega = .86, over 10 periods of the drive. The exact motion reaches or leaves a flank "
-        f"{int(exact.event_count)} times; the rms of u is {size:.3f}. The averaged "
-        "motion has no mean, since B0 does not enter.\n"
+        f"{int(exact.event_count)} times; the rms of u is {size:.3f}. The averaged motion "
+        "has no mean, since B0 does not enter."
     )
-    head = ["", "amplitude at t = 0", "after 10 periods", "rms difference of u from the exact motion"]
-    return f"## Transient\n\n{text}\n{markdown(head, rows)}", found
+    head = " | amplitude at t = 0 | after 10 periods | rms difference of u from the exact motion"
+    return section("Transient", text, head, rows), found
 
 
 def everything(found: dict[str, str]) -> str:
@@ -197,18 +195,10 @@ def everything(found: dict[str, str]) -> str:
     ds = package("multiple_scales", CURVES, [0.8], fit_range=1.0).isel(omega=0)
     peak, place = 2 * float(ds.peak_amplitude), float(ds.peak_frequency)
     return inventory(
-        "rattle",
-        l1=f"{l1:.4f}",
-        l2=f"{l2:.4f}",
-        scales=f"{peak:.4f}",
-        scales_at=f"{place:.4f}",
-        exact=f"{EXACT_PEAK:.4f}",
-        exact_at=f"{EXACT_PEAK_FREQUENCY}",
-        place=f"{place / EXACT_PEAK_FREQUENCY - 1:+.1%}",
-        value=f"{peak / EXACT_PEAK - 1:+.1%}",
-        small=f"{l2 * (peak / 2) ** 2 / l1:.2f}",
-        **found,
-    )
+        "rattle", l1=f"{l1:.4f}", l2=f"{l2:.4f}", scales=f"{peak:.4f}", scales_at=f"{place:.4f}",
+        exact=f"{EXACT_PEAK:.4f}", exact_at=f"{EXACT_PEAK_FREQUENCY}", place=f"{place / EXACT_PEAK_FREQUENCY - 1:+.1%}",
+        value=f"{peak / EXACT_PEAK - 1:+.1%}", small=f"{l2 * (peak / 2) ** 2 / l1:.2f}", **found,
+    )  # fmt: skip
 
 
 def page(full: bool) -> Page:

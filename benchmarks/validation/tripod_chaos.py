@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import drivetrain_jax as dt
-from benchmarks.validation.document import markdown
+from benchmarks.validation.document import section
 from drivetrain_jax.analysis.lyapunov.section_measures import paper_estimator
 from drivetrain_jax.systems import Flow
 from tests.oracles.chaos_reference import scipy_spectrum, tripod_field
@@ -21,14 +21,9 @@ BETA = math.radians(9)
 CLAIMS = {"input": (0.0026, (0.0016, 0.0073, 0.011), 3066.5), "output": (0.0027, (0.0016, 0.0064, 0.0104), 2792.0)}
 # Constants of (29) at 9 degrees, chi_n = 0.0026, from ../shared/reference, for the independent computation.
 _CONSTANTS = {
-    "Omega": 9633.726700903984,
-    "chi": 0.0026,
-    "c1": 0.005213670937369757,
-    "c2": 0.0016565396527480861,
-    "A_TJ": 3.652758897391374e-05,
-    "F_over_I": 8365.245060248115,
-    "chi_T": 0.05,
-}
+    "Omega": 9633.726700903984, "chi": 0.0026, "c1": 0.005213670937369757, "c2": 0.0016565396527480861,
+    "A_TJ": 3.652758897391374e-05, "F_over_I": 8365.245060248115, "chi_T": 0.05,
+}  # fmt: skip
 _SPECTRUM = ("lyapunov_spectrum", "lyapunov_standard_error", "sum_rule_residual", "verdict")
 
 
@@ -61,18 +56,15 @@ def spectra_section() -> str:
         exact = floquet_exponents(element, zetas, chi, frequency)
         for i, zeta in enumerate(zetas):
             spectrum, error = ours.lyapunov_spectrum.values[i], ours.lyapunov_standard_error.values[i]
-            rows.append([
-                f"{element}, zeta {zeta:g}", "chaotic", _pair(spectrum, 6), f"{error.max():.2g}", _pair(exact[i], 6),
-                kinds(ours)[i], f"{abs(float(ours.sum_rule_residual[i])):.1e}",
-            ])  # fmt: skip
-    head = ["", "published", "ours / s^-1", "standard error", "Floquet / s^-1", "our verdict", "sum rule residual"]
-    return "\n".join([
-        "## Lyapunov exponents at the paper's settings (Figs 17-24)\n",
+            values = f"{_pair(spectrum, 6)} | {error.max():.2g} | {_pair(exact[i], 6)} | {kinds(ours)[i]}"
+            rows.append(f"{element}, zeta {zeta:g} | chaotic | {values} | {abs(float(ours.sum_rule_residual[i])):.1e}")
+    text = (
         "The published figures show the estimator (31)-(36), which is not a Lyapunov exponent "
         "([theory/lyapunov.md](../theory/lyapunov.md)). The true exponents are those of a linear damped oscillator with "
-        "periodic stiffness; the torque shifts them by less than 1e-4.\n",
-        markdown(head, rows),
-    ])  # fmt: skip
+        "periodic stiffness; the torque shifts them by less than 1e-4."
+    )
+    head = " | published | ours / s^-1 | standard error | Floquet / s^-1 | our verdict | sum rule residual"
+    return section("Lyapunov exponents at the paper's settings (Figs 17-24)", text, head, rows)
 
 
 # Figures 17-24: element, damping ratio, published verdict. Figures 20 and 24 are the two that are not chaotic.
@@ -97,17 +89,17 @@ def estimator_section() -> str:
     for name, flow, exact in _known_motions():
         found = np.asarray(jax.jit(lambda flow=flow: paper_estimator(flow, 48, 100.0, jnp.asarray(True)))())[:, 0]
         rows.append([name, "", *_criteria(found), exact])
-    head = [
-        "", "published", "(31)-(36) / s^-1", "(37): one is positive", "(38): one is near 0", "(39): the sum is negative",
-        "true exponents / s^-1",
-    ]  # fmt: skip
+    head = (
+        " | published | (31)-(36) / s^-1 | (37): one is positive | (38): one is near 0 | (39): the sum is negative | "
+        "true exponents / s^-1"
+    )
     text = (
         "The paper's rule: on every interval a perturbation of 1e-5, proportional to the solution. It does not print the "
         f"interval (here one period of the excitation, {strobes} in all); the first one, from rest, has no perturbation "
         "and is left out. The values scale with the inverse of the interval. (38) never holds: no "
-        "value is near 0. (37) holds for the damped oscillator alone.\n"
+        "value is near 0. (37) holds for the damped oscillator alone."
     )
-    return f"## The criteria (37)-(39) on the paper's estimator\n\n{text}\n" + markdown(head, rows)
+    return section("The criteria (37)-(39) on the paper's estimator", text, head, rows)
 
 
 def _criteria(values: np.ndarray) -> list[str]:
@@ -148,11 +140,9 @@ def independent_section() -> str:
     )
     rest = {"points": {"zeta": [0.0073]}, "fixed": {"chi_n": 0.0026, "excitation_frequency": 3066.5}}
     ours = run("lyapunov", "input", ["lyapunov_spectrum"], rest, max_time=(strobes - 0.5) / 3066.5, steps=12)
-    rows = [[
-        "sum of the exponents, zeta 0.0073", f"{float(ours.lyapunov_spectrum.sum()):.6f}", f"{scipy.sum():.6f}",
-        "agree; windows differ by the discarded transient",
-    ]]  # fmt: skip
-    return "## An independent computation\n\n" + markdown(["", "ours", "SciPy DOP853, 1e-11, with QR", ""], rows)
+    sums = f"{float(ours.lyapunov_spectrum.sum()):.6f} | {scipy.sum():.6f}"
+    row = f"sum of the exponents, zeta 0.0073 | {sums} | agree; windows differ by the discarded transient"
+    return section("An independent computation", "", " | ours | SciPy DOP853, 1e-11, with QR | ", [row])
 
 
 def controls_section(full: bool) -> str:
@@ -162,31 +152,21 @@ def controls_section(full: bool) -> str:
     ours = run("lyapunov", "input", _SPECTRUM, rest, max_time=1.2, steps=12)
     exact = [floquet_exponents("input", [0.0016], chi, 3066.5)[0, 0] for chi in points["chi_n"]]
     rows = [
-        [
-            f"homogeneous, chi_n {chi:g}",
-            f"Floquet {value:.4f}",
-            f"{float(ours.lyapunov_spectrum[i, 0]):.4f}",
-            kinds(ours)[i],
-        ]
+        f"homogeneous, chi_n {chi:g} | Floquet {value:.4f} | {float(ours.lyapunov_spectrum[i, 0]):.4f} | {kinds(ours)[i]}"
         for i, (chi, value) in enumerate(zip(points["chi_n"], exact, strict=True))
     ]
     chaos = chaotic_control(128 if full else 64)
-    rows.append([
-        "chi_n 0.3, zeta 0.03, torque x 8.4e4, chi_AEM 0.5", "1218 +- 12, K 0.997",
-        f"{float(chaos.lyapunov_spectrum[0, 0]):.0f} +- {float(chaos.lyapunov_standard_error[0, 0]):.0f}, "
-        f"K {float(chaos.chaos_k01[0]):.3f}",
-        kinds(chaos)[0],
-    ])  # fmt: skip
+    value, error = (float(chaos[name][0, 0]) for name in ("lyapunov_spectrum", "lyapunov_standard_error"))
+    found = f"{value:.0f} +- {error:.0f}, K {float(chaos.chaos_k01[0]):.3f} | {kinds(chaos)[0]}"
+    rows.append(f"chi_n 0.3, zeta 0.03, torque x 8.4e4, chi_AEM 0.5 | 1218 +- 12, K 0.997 | {found}")
     text = (
         "The verdict detects instability and chaos where (29) has them. The last row is an unphysical control. The "
         "theory note gives -6.83, 6.43 and 28.39 for the first three. These are means over about 4000 strobes from "
         "the displacement (1, 0) at t = 0, with the initial alignment included; 4000 powers of the monodromy matrix "
         "by SciPy give -6.826, 6.434 and 28.399, and 20,000 give -6.604, 6.671 and 28.659. The limits are the "
-        "Floquet exponents in the table.\n"
+        "Floquet exponents in the table."
     )
-    return "\n".join(
-        ["## Positive controls\n", text, markdown(["", "independent", "ours / s^-1", "our verdict"], rows)]
-    )
+    return section("Positive controls", text, " | independent | ours / s^-1 | our verdict", rows)
 
 
 def chaotic_control(steps: int) -> Any:
@@ -210,14 +190,12 @@ def sections_section(full: bool) -> str:
         ours = run("poincare", element, outputs, rest, strobes=strobes, discard=10000, steps=24)
         for i, zeta in enumerate(zetas):
             count = int(ours.distinct_points[i])
-            rows.append([
-                f"{element}, zeta {zeta:g}", '"diffuse structure", strange attractor',
-                f"{float(ours.torus_residual[i].max()):.1e}", str(count) if count else "no repetition",
-                f"{float(ours.chaos_k01[i]):.3f}",
-            ])  # fmt: skip
-    head = ["", "published", "distance from a smooth curve / largest value", "distinct points", "K"]
-    text = f"{strobes} strobes after 10,000 discarded ones, 24 steps of order 8 per strobe.\n"
-    return "\n".join(["## Poincare sections (Figs 25-30)\n", text, markdown(head, rows)])
+            residual, k01 = float(ours.torus_residual[i].max()), float(ours.chaos_k01[i])
+            found = f"{residual:.1e} | {count or 'no repetition'} | {k01:.3f}"
+            rows.append(f'{element}, zeta {zeta:g} | "diffuse structure", strange attractor | {found}')
+    head = " | published | distance from a smooth curve / largest value | distinct points | K"
+    text = f"{strobes} strobes after 10,000 discarded ones, 24 steps of order 8 per strobe."
+    return section("Poincare sections (Figs 25-30)", text, head, rows)
 
 
 def _pair(values: Sequence[float], digits: int = 4) -> str:
@@ -226,10 +204,5 @@ def _pair(values: Sequence[float], digits: int = 4) -> str:
 
 def sections(full: bool) -> tuple[str, ...]:
     """The chaos part of the tripod's page."""
-    return (
-        spectra_section(),
-        estimator_section(),
-        independent_section(),
-        controls_section(full),
-        sections_section(full),
-    )
+    chaos = spectra_section(), estimator_section(), independent_section()
+    return *chaos, controls_section(full), sections_section(full)
