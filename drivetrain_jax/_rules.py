@@ -232,10 +232,15 @@ BUILT_IN = {
         predicted="all",
     ),
     "forced": Declared(
-        (within("amplitude", 0.0), within("condition", 1.0), within("orbit_amplitude", 0.0)),
+        (within("amplitude", 0.0), within("condition", 1.0), within("orbit_amplitude", 0.0), within("torque", 0.0)),
         kept=("condition",),
-        panels=(("amplitude", "orbit_amplitude"), ("orbit_spectral_radius",), ("condition",)),
-        logarithmic=("amplitude", "orbit_amplitude", "condition"),
+        panels=(
+            ("amplitude", "orbit_amplitude"),
+            ("torque", "orbit_torque"),
+            ("orbit_spectral_radius",),
+            ("condition",),
+        ),
+        logarithmic=("amplitude", "orbit_amplitude", "torque", "orbit_torque", "condition"),
         predicted="forced",
     ),
     "history": Declared(figure="motions.history"),

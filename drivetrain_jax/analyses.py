@@ -376,7 +376,8 @@ def forced(system: System, *, outputs: Sequence[str] | None = None, **options: A
     """Periodic response to the forcing: of the linear system, ``y0 = (I - Z)^-1 r``, and the nonlinear orbit.
 
     Args as of :func:`floquet`. Outputs: ``periodic_state`` (4,), ``amplitude`` (2,) [rad], ``condition`` (default);
-    ``orbit_state``, ``orbit_amplitude``, ``orbit_spectral_radius``. All are differentiable.
+    ``orbit_state``, ``orbit_amplitude``, ``orbit_spectral_radius``; of a driveline also ``torque`` and ``orbit_torque`` (N,)
+    [N m]. All are differentiable.
 
     >>> import drivetrain_jax as dt
     >>> shaft = dt.Cardan(beta=0.3, Omega=1.0, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)

@@ -302,6 +302,8 @@ class System(eqx.Module):
     state_axis: ClassVar[Dimension | None] = None
     #: Dimension of the components of the state whose amplitudes ``forced`` reports.
     displacements: ClassVar[Dimension | None] = None
+    #: Unit of the torques that ``forced`` reports at the displacements; empty: none.
+    torque_units: ClassVar[str] = ""
     #: Names of the families of ``modes`` by their codes.
     mode_families: ClassVar[tuple[str, ...]] = ()
     #: The parameters, which follow from the fields.

@@ -238,7 +238,8 @@ class ForcedModel(eqx.Module):
 
     ``field(t, y)`` is the nonlinear system ``y' = field(t, y)`` of period ``period`` and ``linear(t, y)`` its
     linearisation about ``y = 0``, forcing included. Both act on states of shape ``(n,)``. ``displacements`` are the
-    indices of the components whose amplitude is reported. ``size`` is n if it depends on the parameters.
+    indices of the components whose amplitude is reported, and ``torques`` the rows ``(k, n)`` that give the torques there
+    from a state. ``size`` is n if it depends on the parameters.
     """
 
     field: Callable[[Any, Array], Array]
@@ -246,6 +247,12 @@ class ForcedModel(eqx.Module):
     period: Any
     displacements: tuple[int, ...] = eqx.field(static=True)
     size: int | None = eqx.field(static=True, default=None)
+    torques: Any = None
+
+    def peaks(self, n: int, torques: bool) -> Array:
+        """The rows of the displacements, and of the ``torques`` if they are asked for, in a state of size n."""
+        rows = jnp.eye(n)[jnp.array(self.displacements)]
+        return jnp.concatenate([rows, self.torques]) if torques else rows
 
 
 Components = tuple[Any, ...]

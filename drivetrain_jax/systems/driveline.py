@@ -341,6 +341,7 @@ class Driveline(System):
     mode_families = ("torsional",)
     state = (Component("theta", "rad", "twist of a shaft"), Component("theta_rate", "1", "d theta/d tau", "θ'"))
     state_axis = displacements = SHAFT
+    torque_units = "N m"
 
     speed: Number = parameter("rad/s", "speed of the driven end", **POSITIVE)
     k: Entries = parameter("N m/rad", "stiffness of the shafts", open_lower=True, **_LIST)
@@ -576,7 +577,8 @@ class Driveline(System):
     def forced_model(self) -> ForcedModel:
         """The nonlinear chain, and its linearisation (A) in twists with the forcing of the rigid motion."""
         count, period = len(self.k), math.pi * self.half_turns()
-        return ForcedModel(self.vector_field, self.linear_field, period, tuple(range(count)), 2 * count)
+        torques = jnp.concatenate([jnp.diag(jnp.stack(x)) for x in (self.k, [self.speed * c for c in self.c])], axis=1)
+        return ForcedModel(self.vector_field, self.linear_field, period, tuple(range(count)), 2 * count, torques)
 
     @serves("history", check=check)
     def flow(self) -> Flow:

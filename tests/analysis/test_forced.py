@@ -299,7 +299,7 @@ def test_peaks_between_steps(frequency):
         return jnp.stack([y[1], -(frequency**2) * y[0]])
 
     start = jnp.array([math.cos(0.4), -frequency * math.sin(0.4)]) / frequency
-    peak, when, end, outcome = quick_jit(lambda y: amplitudes(field, y, 6.1, (0, 1), 1e-12))(start)
+    peak, when, end, outcome = quick_jit(lambda y: amplitudes(field, y, 6.1, jnp.eye(2), 1e-12))(start)
     assert outcome == Outcome.SUCCESS
     np.testing.assert_allclose(peak, (1 / frequency, 1.0), rtol=2e-9)
     angle = frequency * when + 0.4
@@ -311,7 +311,7 @@ def test_peaks_between_steps(frequency):
 def test_field_that_is_not_finite():
     for broken in (lambda t, y: y * jnp.nan, lambda t, y: y**2):
         assert integrate(broken, jnp.ones(2), 3.0, 1e-8)[1] == Outcome.NOT_FINITE
-        assert amplitudes(broken, jnp.ones(2), 3.0, (0,), 1e-8)[3] == Outcome.NOT_FINITE
+        assert amplitudes(broken, jnp.ones(2), 3.0, jnp.eye(1, 2), 1e-8)[3] == Outcome.NOT_FINITE
 
 
 @pytest.mark.full

@@ -13,7 +13,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.fft import fft, fftfreq, ifft
 from scipy.integrate import solve_ivp
+from scipy.linalg import solve
 
 Chain = Mapping[str, Any]
 _STEP = 1e-30
@@ -97,3 +99,31 @@ def multipliers(chain: Chain, period: float, rtol: float = 1e-11) -> np.ndarray:
 
     end = solve_ivp(field, (0.0, period), np.eye(n).ravel(), method="DOP853", rtol=rtol, atol=rtol / 100)
     return np.linalg.eigvals(end.y[:, -1].reshape(n, n))
+
+
+def harmonic_response(chain: Chain, period: float, samples: int, finer: int = 64) -> tuple[np.ndarray, np.ndarray]:
+    """Largest twists [rad] and torques [N m] of the shafts in the forced motion of the linear equations, ``(N,)`` each.
+
+    Harmonics up to half of ``samples`` meet the equations at the samples; ``finer`` times as many points show the peaks.
+    """
+    n, w, times = len(chain["k"]), chain["speed"], period * np.arange(samples) / samples
+    rates = np.array([rigid(chain, tau)[1] for tau in times])
+    wave = 2j * math.pi * fftfreq(samples, period / samples)
+
+    def derivative(values: np.ndarray) -> np.ndarray:
+        return ifft(wave[:, None] * fft(values, axis=0), axis=0).real
+
+    # y' - A y = f at every sample, y = (x, x'), f = (0, -Psi'').
+    system = np.kron(derivative(np.eye(samples)), np.eye(2 * n))
+    for i, tau in enumerate(times):
+        system[2 * n * i : 2 * n * (i + 1), 2 * n * i : 2 * n * (i + 1)] -= linear_matrix(chain, float(tau))
+    forcing = np.hstack([np.zeros((samples, n)), -derivative(rates)])
+    x = solve(system, forcing.ravel()).reshape(samples, 2 * n)[:, :n]
+    onward = np.hstack([np.zeros((samples, 1)), rates[:, 1:] / rates[:, :-1] * x[:, :-1]])
+    twist = x - onward
+    torque = np.asarray(chain["k"]) * twist + w * np.asarray(chain["c"]) * derivative(twist)
+    fine = np.zeros((finer * samples, 2 * n), complex)
+    place = np.concatenate([np.arange(samples // 2), np.arange(-samples // 2, 0)])
+    fine[place] = finer * fft(np.hstack([twist, torque]), axis=0)
+    peaks = np.abs(ifft(fine, axis=0).real).max(axis=0)
+    return peaks[:n], peaks[n:]

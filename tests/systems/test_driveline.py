@@ -219,6 +219,31 @@ def test_linearisation_is_that_of_lagrange_multipliers():
 
 
 @pytest.mark.full
+@pytest.mark.parametrize("number", range(3))
+def test_forced_twists_and_torques_are_those_of_harmonics(number):
+    chain = lagrange_cases()[number]
+    shaft = dt.Driveline(**chain)
+    found = dt.forced(shaft)
+    twist, torque = oracle.harmonic_response(chain, float(shaft.forced_model().period), 96)
+    np.testing.assert_allclose(found.amplitude, twist, rtol=2e-6)
+    np.testing.assert_allclose(found.torque, torque, rtol=2e-6)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", ["torque", "orbit_torque"])
+def test_derivatives_of_torques_are_those_of_differences(name):
+    chain: dict[str, Any] = {name: x for name, x in lagrange_cases()[0].items() if name not in ("phase", "ratio")}
+    chain |= {"beta": [0.0, 0.3, 0.0]}
+    torque = lambda s: getattr(dt.forced(s, outputs=[name], rtol=1e-12), name)[1]  # noqa: E731
+    slope = jax.grad(torque)(dt.Driveline(**chain))
+    for key, i in (("k", 1), ("c", 1), ("J", 0), ("beta", 1)):
+        step = 1e-4 * chain[key][i]
+        moved: list[Any] = [[x + s * (j == i) for j, x in enumerate(chain[key])] for s in (-step, step)]
+        ends = [float(torque(dt.Driveline(**{**chain, key: values}))) for values in moved]
+        assert getattr(slope, key)[i] == pytest.approx((ends[1] - ends[0]) / (2 * step), rel=1e-5)
+
+
+@pytest.mark.full
 @pytest.mark.parametrize("number", range(7))
 def test_multipliers_are_those_of_lagrange_multipliers(number):
     chain = lagrange_cases()[number]

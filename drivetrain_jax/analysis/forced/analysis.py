@@ -57,7 +57,7 @@ EDGE = 0.01
 
 
 class _Peaks(NamedTuple):
-    """State of the loop of :func:`amplitudes`: the next step ``[t0, t1]`` from ``y``, flags ``aimed`` (k,) of the components
+    """State of the loop of :func:`amplitudes`: the next step ``[t0, t1]`` from ``y``, flags ``aimed`` (k,) of the rows
     whose peak is at ``t1``, and the largest values so far with their times ``when``."""
 
     t0: Array
@@ -73,9 +73,9 @@ class _Peaks(NamedTuple):
 
 
 def amplitudes(
-    field: Field, start: Array, period: float, indices: tuple[int, ...], rtol: float
+    field: Field, start: Array, period: float, rows: Array, rtol: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Largest ``|y_i|`` over a period for the components ``indices``, their times, the state at its end, and an ``Outcome``.
+    """Largest ``|row . y|`` over a period for ``rows`` (k, n), their times, the state at its end, and an ``Outcome``.
 
     Every accepted step of the integration is searched for a peak, so that none is missed however fast the solution
     oscillates. A step with a new largest value is repeated so that it ends at the peak: the solver's continuous extension
@@ -99,7 +99,7 @@ def amplitudes(
         # An empty step ends the loop: the controller has stopped.
         t1 = jnp.where(result == diffrax.RESULTS.successful, jnp.minimum(t1, period), t0)
         between = solver.interpolation_cls(t0=s.t0, t1=s.t1, **dense)
-        peaks = _peaks_on_step(field, between.evaluate, s.t0, s.t1, s.y, y1, indices)
+        peaks = _peaks_on_step(field, between.evaluate, s.t0, s.t1, s.y, y1, rows)
         (largest, when), aimed, nearest = _larger_peaks(s, peaks, keep)
         again = jnp.any(aimed)
         t0, t1 = jnp.where(again, s.t0, t0), jnp.where(again, nearest, t1)
@@ -113,7 +113,7 @@ def amplitudes(
     zero = jnp.zeros(())
     t1, controlled = control.init(term, zero, period, fixed(start), None, None, solver.func, order)
     t1 = jnp.minimum(t1, period)
-    first = _at_start(t1, start, indices, solver.init(term, zero, t1, start, None), controlled)
+    first = _at_start(t1, start, rows, solver.init(term, zero, t1, start, None), controlled)
     last = jax.lax.while_loop(unfinished, advance, first)
     stopped = jnp.where(last.count < MAX_STEPS, Outcome.NOT_FINITE, Outcome.STEP_LIMIT)
     return last.largest, last.when, last.y, jnp.where(last.t0 < period, stopped, Outcome.SUCCESS)
@@ -124,9 +124,9 @@ def _larger(best: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Arra
     return jnp.maximum(best[0], other[0]), jnp.where(other[0] > best[0], other[1], best[1])
 
 
-def _at_start(t1: Array, start: Array, indices: tuple[int, ...], solver: Any, control: Any) -> _Peaks:
+def _at_start(t1: Array, start: Array, rows: Array, solver: Any, control: Any) -> _Peaks:
     """The loop before its first step, to ``t1``."""
-    largest, zero = jnp.abs(start[jnp.array(indices)]), jnp.zeros(())
+    largest, zero = jnp.abs(rows @ start), jnp.zeros(())
     jump, count = jnp.array(False), jnp.zeros((), int)
     return _Peaks(zero, t1, start, largest < 0, largest, 0 * largest, count, jump, solver, control)
 
@@ -143,8 +143,8 @@ def _larger_peaks(s: _Peaks, peaks: _Found, keep: Any) -> tuple[tuple[Array, Arr
 
 
 class _Found(NamedTuple):
-    """``|y_i|`` on a step: ``at_end``, extrapolated to the peak ``near_end`` by the time ``late``, and the largest ``value``
-    in between, at the fraction ``place``, or 0 if there is none."""
+    """``|row . y|`` on a step: ``at_end``, extrapolated to the peak ``near_end`` by the time ``late``, and the largest
+    ``value`` in between, at the fraction ``place``, or 0 if there is none."""
 
     at_end: Array
     near_end: Array
@@ -153,10 +153,8 @@ class _Found(NamedTuple):
     place: Array
 
 
-def _peaks_on_step(
-    field: Field, evaluate: Callable, t0: Array, t1: Array, y0: Array, y1: Array, indices: tuple[int, ...]
-) -> _Found:
-    """Largest ``|y_i|`` on a step, at its end and where the derivative changes sign in between.
+def _peaks_on_step(field: Field, evaluate: Callable, t0: Array, t1: Array, y0: Array, y1: Array, rows: Array) -> _Found:
+    """Largest ``|row . y|`` on a step, at its end and where the derivative changes sign in between.
 
     A cubic through y' and y'' at both ends interpolates the derivative. The parabola y - d^2/(2 y'') removes the derivative
     d that remains at its root.
@@ -169,16 +167,16 @@ def _peaks_on_step(
 
     (slope0, curve0), (slope1, curve1) = derivatives(t0, y0), derivatives(t1, y1)
 
-    def peak_of(i: Array) -> _Found:
-        x, inside = _cubic_root(slope0[i], slope1[i], h * curve0[i], h * curve1[i])
-        y = evaluate(t0 + x * h)
-        slope, curve = (d[i] for d in derivatives(t0 + x * h, y))
-        value, shift = _vertex(y[i], slope, curve)
-        near_end, late = _vertex(y1[i], slope1[i], curve1[i])
+    def peak_of(row: Array) -> _Found:
+        x, inside = _cubic_root(row @ slope0, row @ slope1, h * (row @ curve0), h * (row @ curve1))
+        y, end = evaluate(t0 + x * h), row @ y1
+        slope, curve = (row @ d for d in derivatives(t0 + x * h, y))
+        value, shift = _vertex(row @ y, slope, curve)
+        near_end, late = _vertex(end, row @ slope1, row @ curve1)
         between = jnp.where(inside, jnp.abs(value), 0.0), jnp.clip(x + shift / h, 0.0, 1.0)
-        return _Found(jnp.abs(y1[i]), jnp.abs(near_end), late, *between)
+        return _Found(jnp.abs(end), jnp.abs(near_end), late, *between)
 
-    return jax.vmap(peak_of)(jnp.array(indices))
+    return jax.vmap(peak_of)(rows)
 
 
 def _vertex(y: Array, slope: Array, curve: Array) -> tuple[Array, Array]:
@@ -202,10 +200,9 @@ def _cubic_root(p0: Array, p1: Array, d0: Array, d1: Array) -> tuple[Array, Arra
     return x, inside
 
 
-LINEAR = ("periodic_state", "periodic_state_error", "amplitude", "amplitude_phase", "condition")
-PEAKS = frozenset(("amplitude", "amplitude_phase"))
-ORBIT_PEAKS = frozenset(("orbit_amplitude", "orbit_amplitude_phase"))
-PERIODIC, ORBITS = PEAKS | {"periodic_state"}, ORBIT_PEAKS | {"orbit_state"}
+TORQUES = frozenset(("torque", "torque_phase", "orbit_torque", "orbit_torque_phase"))
+PEAKS = frozenset(("amplitude", "amplitude_phase", "torque", "torque_phase"))
+LINEAR = PEAKS | {"periodic_state", "periodic_state_error", "condition"}
 
 Build = Callable[[Mapping[str, Any]], ForcedModel]
 
@@ -235,12 +232,12 @@ CHUNK, ORBITS_CHUNK = 128, 16
 
 
 class Response(NamedTuple):
-    """Periodic solution of the linear system: ``state`` (n,), absolute ``error``, ``amplitude`` and its ``phase`` (None
-    unless requested), and the map over one period."""
+    """Periodic solution of the linear system: ``state`` (n,), absolute ``error``, the ``largest`` values and their ``phase``
+    (None unless requested), and the map over one period."""
 
     state: Array
     error: Array
-    amplitude: Array | None
+    largest: Array | None
     phase: Array | None
     step: Transition
     outcome: Array
@@ -264,8 +261,8 @@ def _mapped(model: ForcedModel, n: int, rtol: float) -> tuple[Transition, Array,
     return step, newton_step(step, rest), forcing
 
 
-def linear_response(model: ForcedModel, n: int, rtol: float, with_amplitude: bool) -> Response:
-    """Periodic solution of ``y' = linear(t, y)``; ``n`` is the size of the state.
+def linear_response(model: ForcedModel, n: int, rtol: float, rows: Array | None) -> Response:
+    """Periodic solution of ``y' = linear(t, y)``, with the largest ``|row . y|``; ``n`` is the size of the state.
 
     ``y0 = (I - Z)^-1 r`` is integrated over another period. The closing error times (I - Z)^-1 corrects ``y0``. The stored
     error is this correction plus (I - Z)^-1 times the assumed error of the closing integration.
@@ -276,7 +273,7 @@ def linear_response(model: ForcedModel, n: int, rtol: float, with_amplitude: boo
     unit = jnp.where(exists, unit, 0.0)
     size = size_of(unit)
     start, field, sharp = unit / size, in_units_of(size * forcing, model.linear), _sharpness(rtol, CLOSING_SHARPNESS)
-    (largest, phase), correction, closed = _closed(model, field, start, step.matrix, sharp, with_amplitude)
+    (largest, phase), correction, closed = _closed(model, field, start, step.matrix, sharp, rows)
     error = jnp.max(jnp.abs(correction)) + CLOSING_ERROR * sharp * _gain(step.matrix)
     lost = ~exists | ~(error <= NOT_FOUND) | ~_regular(step.matrix, rtol)
     missed = jnp.where(error > rtol, Outcome.TOLERANCE_NOT_MET, Outcome.SUCCESS)
@@ -290,12 +287,12 @@ def linear_response(model: ForcedModel, n: int, rtol: float, with_amplitude: boo
 
 
 def _closed(
-    model: ForcedModel, field: Field, start: Array, matrix: Array, sharp: float, with_amplitude: bool
+    model: ForcedModel, field: Field, start: Array, matrix: Array, sharp: float, rows: Array | None
 ) -> tuple[tuple[Array | None, Array | None], Array, Array]:
-    """Largest displacements over a period and their phases (None unless requested), the correction of ``start`` by the
-    closing error, and the outcome. ``start`` is of order one; ``matrix`` is the transition."""
-    if with_amplitude:
-        largest, phase, end, closed = amplitudes(field, start, model.period, model.displacements, sharp)
+    """Largest ``|row . y|`` over a period and their phases (None without rows), the correction of ``start`` by the closing
+    error, and the outcome. ``start`` is of order one; ``matrix`` is the transition."""
+    if rows is not None:
+        largest, phase, end, closed = amplitudes(field, start, model.period, rows, sharp)
     else:
         (largest, phase), (end, closed) = (None, None), integrate(field, start, model.period, sharp)
     return (largest, phase), newton_step(Transition(end, matrix, closed), start), closed
@@ -320,8 +317,8 @@ def _condition(matrix: Array) -> Array:
 
 
 class Found(NamedTuple):
-    """An orbit, the largest displacements on it with their phases (k,), its spectral radius, and the number of different
-    orbits at the point."""
+    """An orbit, the largest displacements on it, and torques if asked for, with their phases (k,), its spectral radius, and
+    the number of different orbits at the point."""
 
     orbit: Orbit
     largest: Array
@@ -330,7 +327,9 @@ class Found(NamedTuple):
     count: Array  # pyright: ignore[reportIncompatibleMethodOverride]
 
 
-def nonlinear_orbit(model: ForcedModel, response: Response, rtol: float, search: Callable[[Array], Array]) -> Found:
+def nonlinear_orbit(
+    model: ForcedModel, response: Response, rtol: float, search: Callable[[Array], Array], rows: Array
+) -> Found:
     """The stable periodic orbit of the smallest amplitude, or the smallest one if none is stable.
 
     The orbits are that on the path that starts along ``response``, and those near the states ``search(wanted)`` (m, n).
@@ -352,10 +351,11 @@ def nonlinear_orbit(model: ForcedModel, response: Response, rtol: float, search:
     # One after another, because points have few: in a batch, a missing orbit would cost as much as one.
     others = jax.lax.map(partial(_corrected, model, rtol), others)
     every = jax.tree.map(lambda x, more: jnp.concatenate([jnp.asarray(x)[None], more]), first, others)
-    every = jax.lax.map(partial(_finished, model, rtol), every)
+    every = jax.lax.map(partial(_finished, model, rtol, rows), every)
     exists = every.orbit.outcome < Outcome.NOT_CONVERGED
     unstable = every.radius > 1 + STABLE_MARGIN
-    best = jnp.lexsort((jnp.max(every.largest, axis=1), unstable, ~exists))[0]
+    amplitude = every.largest[:, : len(model.displacements)]
+    best = jnp.lexsort((jnp.max(amplitude, axis=1), unstable, ~exists))[0]
     return jax.tree.map(lambda x: x[jnp.where(jnp.any(exists), best, 0)], every)._replace(
         count=jnp.sum(distinct(every.orbit.state, SAME))
     )
@@ -370,22 +370,23 @@ def distinct(states: Array, near: float) -> Array:
 
 def orbits_near(model: ForcedModel, guesses: Array, rtol: float) -> Found:
     """The orbits to which Newton's method leads from ``guesses`` (m, n), as results of m orbits; NaN where there is none."""
-    return jax.vmap(lambda guess: _finished(model, rtol, _corrected(model, rtol, guess)))(guesses)
+    rows = model.peaks(guesses.shape[1], torques=False)
+    return jax.vmap(lambda guess: _finished(model, rtol, rows, _corrected(model, rtol, guess)))(guesses)
 
 
 def _corrected(model: ForcedModel, rtol: float, guess: Array) -> Orbit:
     return corrected(model.field, guess, model.period, _sharpness(rtol, TRANSITION_SHARPNESS))
 
 
-def _finished(model: ForcedModel, rtol: float, orbit: Orbit) -> Found:
-    """``orbit`` corrected by its closing error, with its largest displacements and its spectral radius."""
+def _finished(model: ForcedModel, rtol: float, rows: Array, orbit: Orbit) -> Found:
+    """``orbit`` corrected by its closing error, with the largest ``|row . y|`` and its spectral radius."""
     exists = orbit.outcome < Outcome.NOT_CONVERGED
     state = jnp.where(exists, orbit.state, 0.0)
     size = size_of(state)
     field, sharp = in_units_of(size, model.field), _sharpness(rtol, CLOSING_SHARPNESS)
     # A missing orbit is integrated over an empty span.
     model = replace(model, period=jnp.where(exists, model.period, 0.0))
-    (largest, phase), correction, closed = _closed(model, field, state / size, orbit.matrix, sharp, True)
+    (largest, phase), correction, closed = _closed(model, field, state / size, orbit.matrix, sharp, rows)
     error = size * jnp.max(jnp.abs(correction)) + orbit.error
     missed = jnp.where(error <= rtol * size, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
     outcome = _worst(orbit.outcome, jnp.where(exists, _worst(closed, missed), orbit.outcome))
@@ -398,15 +399,11 @@ def _finished(model: ForcedModel, rtol: float, orbit: Orbit) -> Found:
     return Found(Orbit(state, matrix, error, outcome, orbit.corrections), largest, phase, radius, exists)
 
 
-def _orbit_results(
-    model: ForcedModel, response: Response, search: Callable[[Array], Array], rtol: float
-) -> tuple[dict[str, Any], Array]:
-    """Results of the nonlinear orbit and their outcome."""
-    best = nonlinear_orbit(model, response, rtol, search)
-    results = {"orbit_state": best.orbit.state, "orbit_state_error": best.orbit.error}
-    results |= {"orbit_amplitude": best.largest, "orbit_amplitude_phase": best.phase}
-    results |= {"orbit_spectral_radius": best.radius, "orbit_count": best.count.astype(jnp.int32)}
-    return results, best.orbit.outcome
+def _tops(model: ForcedModel, prefix: str, largest: Array, phase: Array) -> dict[str, Array]:
+    """The largest displacements and torques with their phases by name."""
+    count, top = len(model.displacements), {"": largest, "_phase": phase}
+    results = {f"{prefix}amplitude{end}": x[:count] for end, x in top.items()}
+    return results | {f"{prefix}torque{end}": x[count:] for end, x in top.items()}
 
 
 def _others(build: Build, n: int, speed: str, values: Mapping[str, Any], wanted: Array) -> Array:
@@ -426,18 +423,22 @@ def _solve(
     """All requested results of one point; ``effort`` only orders the batches, as every integration is adaptive."""
     model, rtol = build(values), request.options["rtol"]
     n = model.size or n
-    response = linear_response(model, n, rtol, not PEAKS.isdisjoint(request.outputs))
+    rows = model.peaks(n, not TORQUES.isdisjoint(request.outputs))
+    response = linear_response(model, n, rtol, None if PEAKS.isdisjoint(request.outputs) else rows)
     results: dict[str, Any] = {"periodic_state": response.state, "periodic_state_error": response.error}
-    results |= {"amplitude": response.amplitude, "amplitude_phase": response.phase}
+    if response.largest is not None and response.phase is not None:
+        results |= _tops(model, "", response.largest, response.phase)
     outcome = response.outcome
     if "condition" in request.outputs:
         results["condition"] = jnp.where(
             response.step.outcome == Outcome.SUCCESS, _condition(response.step.matrix), jnp.nan
         )
-    if not set(request.outputs) <= set(LINEAR):
-        of_orbit, orbit_outcome = _orbit_results(model, response, partial(_others, build, n, speed, values), rtol)
-        results |= of_orbit
-        outcome = _worst(outcome, orbit_outcome)
+    if not LINEAR.issuperset(request.outputs):
+        best = nonlinear_orbit(model, response, rtol, partial(_others, build, n, speed, values), rows)
+        results |= _tops(model, "orbit_", best.largest, best.phase)
+        results |= {"orbit_state": best.orbit.state, "orbit_state_error": best.orbit.error}
+        results |= {"orbit_spectral_radius": best.radius, "orbit_count": best.count.astype(jnp.int32)}
+        outcome = _worst(outcome, best.orbit.outcome)
     return {name: results[name] for name in request.outputs} | {"outcome": outcome.astype(jnp.int8)}
 
 
@@ -467,7 +468,7 @@ def _matrices(build: Build, n: int, moving: int, values: Mapping[str, Any]) -> A
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     build, n = system.models["forced"].build, len(system.state)
     steps = partial(predicted_steps, build, n, len(_displacements(system).values))
-    chunk = CHUNK if set(request.outputs) <= set(LINEAR) else ORBITS_CHUNK
+    chunk = CHUNK if LINEAR.issuperset(request.outputs) else ORBITS_CHUNK
     solve = over_lanes(partial(_solve, build, n, system.roles.get("speed", ""), request))
     return (Solver("diffrax", solve, steps, seconds=3e-5, chunk=chunk, march=True, short_loops=True),)
 
@@ -476,10 +477,19 @@ def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
 _SECOND = frozenset(("condition", "orbit_spectral_radius"))
 
 
+# A periodic solution, its displacements and its torques, by the field of the model.
+_SOLUTIONS = {
+    "linear": ("periodic_state", "amplitude", "torque"),
+    "field": ("orbit_state", "orbit_amplitude", "orbit_torque"),
+}
+
+
 def _derivative_outputs(outputs: tuple[str, ...]) -> tuple[str, ...]:
-    linear = ("periodic_state",) + (("amplitude_phase",) if "amplitude" in outputs else ())
-    orbit = ("orbit_state",) + (("orbit_amplitude_phase",) if "orbit_amplitude" in outputs else ())
-    return (() if PERIODIC.isdisjoint(outputs) else linear) + (() if ORBITS.isdisjoint(outputs) else orbit)
+    needed: tuple[str, ...] = ()
+    for state, *tops in _SOLUTIONS.values():
+        phases = tuple(f"{name}_phase" for name in tops if name in outputs)
+        needed += (state, *phases) if phases or state in outputs else ()
+    return needed
 
 
 def _derivatives(
@@ -492,10 +502,10 @@ def _derivatives(
         kept = {name: results[name] for name in second}
         asked = Request(second, request.method, request.options)
         slopes |= forward_derivatives(_solvers, system, asked, parameters, constants, kept)
-    for prefix, state, top in (("linear", "periodic_state", "amplitude"), ("field", "orbit_state", "orbit_amplitude")):
-        if state in request.outputs:
+    for field, names in _SOLUTIONS.items():
+        if names[0] in request.outputs:
             model = lambda p: build(eqx.combine(p, constants.tree))  # noqa: E731
-            slopes |= _slopes(model, prefix, parameters, results, (state, top), request.options["rtol"])
+            slopes |= _slopes(model, field, parameters, results, names, request.options["rtol"])
     return slopes
 
 
@@ -504,20 +514,28 @@ def _slopes(
     which: str,
     parameters: Any,
     results: Mapping[str, Array],
-    names: tuple[str, str],
+    names: tuple[str, ...],
     rtol: float,
 ) -> dict[str, Array]:
-    """Jacobians of the periodic solution ``names[0]`` of the field ``which``, and of its amplitude if that is requested."""
+    """Jacobians of the periodic solution ``names[0]`` of the field ``which``, and of ``names[1:]`` that are requested."""
 
     def field(parameters: Any, s: Any, y: Array) -> Array:
         there = model(parameters)
         return there.period * getattr(there, which)(there.period * s, y)
 
-    state, top = names
-    here, phase = model(parameters), f"{top}_phase"
-    peaks = (results[phase] / here.period, here.displacements) if phase in results else (jnp.zeros(0), ())
-    slopes = periodic_slopes(field, parameters, results[state], peaks, _sharpness(rtol, 1.0))
-    return {state: slopes.state} | ({top: slopes.tops} if phase in results else {})
+    here, (state, *tops) = model(parameters), names
+    count, end = len(here.displacements), results[state].size
+    # The rows of displacements come first, then those of torques.
+    parts = {name: slice(k * count, (k + 1) * count) for k, name in enumerate(tops) if f"{name}_phase" in results}
+
+    def rows(parameters: Any) -> Array:
+        every = model(parameters).peaks(end, torques=tops[1] in parts)
+        return jnp.concatenate([jnp.zeros((0, end)), *(every[part] for part in parts.values())])
+
+    places = jnp.concatenate([jnp.zeros(0), *(results[f"{name}_phase"] for name in parts)]) / here.period
+    slopes = periodic_slopes(field, parameters, results[state], (places, rows), _sharpness(rtol, 1.0))
+    ends = dict(zip(parts, jnp.split(slopes.tops, max(len(parts), 1)), strict=False))
+    return {state: slopes.state} | ends
 
 
 def _displacements(system: type[System]) -> Dimension:
@@ -535,6 +553,13 @@ def _of_system(system: type[System]) -> dict[str, Any]:
     units, length = ", ".join(dict.fromkeys(c.units for c in system.state)), system.state[0].units
     moving, state = (_displacements(system).name,), ("state",)
     time = system.unit_of_time()
+    torque = Variable("torque", system.torque_units, "largest torque over the period, linear system", moving)
+    torques = (
+        torque,
+        Variable("torque_phase", time, "time at which the torque is largest, linear system", moving),
+        replace(torque, name="orbit_torque", long_name="largest torque over the period, nonlinear orbit"),
+        Variable("orbit_torque_phase", time, "time at which the torque is largest, nonlinear orbit", moving),
+    )
     variables = (
         Variable("periodic_state", units, "periodic solution of the linear system at the start of a period", state),
         Variable("periodic_state_error", units, "estimated absolute error of periodic_state"),
@@ -548,14 +573,17 @@ def _of_system(system: type[System]) -> dict[str, Any]:
         Variable("orbit_spectral_radius", "1", "spectral radius of the monodromy matrix about the nonlinear orbit"),
         Variable("orbit_count", "1", "number of different nonlinear orbits found (0: none)", dtype="int32"),
     )
-    return {"variables": variables}
+    if not system.torque_units:
+        return {"variables": variables}
+    return {"variables": variables + torques, "default_outputs": (*DEFAULT_OUTPUTS, "torque")}
 
 
+DEFAULT_OUTPUTS = ("periodic_state", "amplitude", "condition")
 ANALYSIS = Analysis(
     name="forced",
     title="forced response",
     variables=(),
-    default_outputs=("periodic_state", "amplitude", "condition"),
+    default_outputs=DEFAULT_OUTPUTS,
     methods={"shooting": ("rtol",)},
     method_titles={"shooting": "periodic orbit by Newton's method over one period"},
     options=(RTOL,),

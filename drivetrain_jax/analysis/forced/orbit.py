@@ -160,27 +160,27 @@ def _settled(relative: Array, shrunk: Array, rtol: float) -> Array:
 
 
 class PeriodicSlopes(NamedTuple):
-    """Derivatives by the P parameters: of the ``state`` at the start, ``(n, P)``, and of the largest displacements
-    ``tops``, ``(k, P)``."""
+    """Derivatives by the P parameters: of the ``state`` at the start, ``(n, P)``, and of the largest values ``tops``,
+    ``(k, P)``."""
 
     state: Array
     tops: Array
 
 
 def periodic_slopes(
-    field: Parametric, parameters: Any, state: Array, peaks: tuple[Array, tuple[int, ...]], rtol: float
+    field: Parametric, parameters: Any, state: Array, peaks: tuple[Array, Callable[[Any], Array]], rtol: float
 ) -> PeriodicSlopes:
     """Derivatives of the periodic solution through ``state`` by all ``parameters``, a pytree of P numbers.
 
     ``field(parameters, s, y)`` returns ``T f`` at the fraction s of the period. ``peaks`` holds the fractions of the period
-    at which displacements have their largest modulus, and the indices of these displacements. NaN where the integration
-    fails.
+    at which the products of rows with y have their largest modulus, and the function of the parameters that returns these
+    rows ``(k, n)``. NaN where the integration fails.
     """
     import diffrax
 
     n, size = state.size, size_of(state)
     lifted, scale = _lifted(field, parameters, n, size)
-    places, indices = peaks
+    places, rows_at = peaks
     order = jnp.argsort(places)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lifted),
@@ -198,9 +198,10 @@ def periodic_slopes(
     values = jnp.where(solution.result == diffrax.RESULTS.successful, solution.ys, jnp.nan)  # pyright: ignore[reportArgumentType]
     on_peaks, end = values[:-1][jnp.argsort(order)], values[-1]
     moved = solve(jnp.eye(n) - end[1 : n + 1].T, end[n + 1 :].T)
+    by_parameter = jnp.stack(jax.tree.leaves(jax.jacfwd(rows_at)(parameters)), axis=-1) * scale
     tops = [
-        jnp.sign(rows[0, i]) * (rows[1 : n + 1, i] @ moved + rows[n + 1 :, i])
-        for rows, i in zip(on_peaks, indices, strict=True)
+        jnp.sign(row @ y[0]) * (row @ (y[1 : n + 1].T @ moved + y[n + 1 :].T) + y[0] @ slope)
+        for y, row, slope in zip(on_peaks, rows_at(parameters), by_parameter, strict=True)
     ]
     return PeriodicSlopes(size * moved / scale, size * jnp.array(tops).reshape(-1, scale.size) / scale)
 
