@@ -153,6 +153,31 @@ def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapp
     return _Job(analysis, type(system), request, Constants(rest), along is not None, single, dimensions), parameters
 
 
+def jacobians(
+    name: str,
+    system: System,
+    outputs: Sequence[str],
+    options: Mapping[str, Any],
+    results: Mapping[str, Any],
+    hold: bool,
+) -> tuple[list[tuple[str, int | None]], dict[str, np.ndarray]]:
+    """Derivatives ``(..., P)`` of ``outputs`` of one concrete ``system`` by P numbers, names with the entry of a list.
+
+    ``results`` hold the values of the outputs, and of those that their derivatives need. With ``hold``, values of 0 and
+    infinity are fixed, which spares the parts of a model that they leave out.
+    """
+    needed = get_analysis(name).derivative_outputs(tuple(outputs))
+    job, parameters = _job(name, system, [*dict.fromkeys((*outputs, *needed))], options)
+    if hold:
+        held = jax.tree.map(lambda x: float(x) if x == 0 or np.isinf(x) else None, parameters)
+        free = jax.tree.map(lambda x: None if x == 0 or np.isinf(x) else x, parameters)
+        job, parameters = replace(job, constants=Constants(eqx.combine(job.constants.tree, held))), free
+    keys = [(str(path[0].key), path[1].idx if path[1:] else None) for path, _ in jax.tree.leaves_with_path(parameters)]
+    values = {key: jnp.asarray(x)[None] if job.path else jnp.asarray(x) for key, x in results.items()}
+    found = _apart(job, "derivatives")((parameters, values))
+    return keys, {key: np.asarray(found[key][0] if job.path else found[key]) for key in outputs if key in found}
+
+
 def _concrete(job: _Job, parameters: Any) -> dict[str, Array]:
     """The results by the solver with the least predicted cost, compiled once for all numbers."""
     columns = eqx.combine(jax.tree.map(lambda x: np.asarray(x)[None], parameters), job.constants.tree)

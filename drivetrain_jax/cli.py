@@ -215,7 +215,7 @@ _COMMANDS: dict[str, tuple[str, tuple[Any, ...]]] = {
         _given("parameters in the units of `drivetrain list SYSTEM`, options, and outputs=NAME,NAME"),
         _DATA, _AMPLITUDE,
         ("--sensitivities", {
-            "action": "store_true", "help": "add those of the spectral radius, largest effect of 1 %% first",
+            "action": "store_true", "help": "add the effect of 1 %% of each value on the results, largest first",
         }),
         _JSON,
     )),

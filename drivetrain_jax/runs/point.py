@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError, aligned, did_you_mean, meant, shown, written
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, get_analysis
@@ -20,7 +21,17 @@ from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.physical import described, read_table
-from drivetrain_jax.runs.reply import Limit, Reply, growth_lines, growth_of, speed_in_rpm, verdict_words
+from drivetrain_jax.runs.reply import (
+    Limit,
+    Reply,
+    differentiable,
+    effect_lines,
+    growth_lines,
+    growth_of,
+    point_sensitivities,
+    speed_in_rpm,
+    verdict_words,
+)
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import Scene, load_scene, system_and_analysis
 
@@ -33,7 +44,7 @@ class PointResult:
     ``labels`` the entries of each dimension of the results, ``physical`` the given physical data and their units,
     ``growth`` what a spectral radius means: rate [1/s], factor per turn, time and turns to double or to halve,
     ``sentence`` the answer of an analysis that has one,
-    ``sensitivities`` those of the spectral radius, largest effect of one percent first (None unless asked for).
+    ``sensitivities`` those of the results, largest effect of one percent first (None unless asked for).
     """
 
     system: str
@@ -214,7 +225,7 @@ def point(
         system, analysis: names, see ``drivetrain list``.
         outputs: results to compute; default: those of the analysis.
         amplitude: limit of the forced amplitude (``"2 deg"``), with which the answer compares the forced motion.
-        sensitivities: adds those of the spectral radius, by the given physical data or the parameters.
+        sensitivities: adds the effect of one percent of each value on the results, by the given physical data or parameters.
         data: a table of parameters (``.csv``, ``.xlsx``, ``.toml``), a column each with its unit (``length [mm]``).
         given: parameters of the system (or its physical data), and options of the analysis (``method``, ``rtol``, ...);
             they override ``data``.
@@ -239,20 +250,40 @@ def point(
         # Messages name the fields without the tables of a scene.
         text = re.sub(r"^(points|fixed|options)\.", "", str(error))
         raise InputError(re.sub(r"^(\w+)\.values = \[(.*?)\]:", r"\1 = \2:", text)) from None
-    if sensitivities and "floquet" not in job.scene.system.models:
-        raise InputError(f"sensitivities: {system} has no spectral radius; allowed for floquet")
+    if sensitivities:
+        analysed, asked = job.scene.analysis, job.scene.request.outputs
+        if analysed.derivatives is None:
+            known = (name for name in analyses_of(job.scene.system) if get_analysis(name).derivatives)
+            raise InputError(f"sensitivities: {analysis} has no derivatives; expected {' or '.join(known) or 'none'}")
+        if not differentiable(analysed, asked):
+            names = ", ".join(v.name for v in differentiable(analysed, [v.name for v in analysed.variables]))
+            raise InputError(f"outputs = {list(asked)}: without sensitivities; expected one of {names}")
+        tree["outputs"] = [*dict.fromkeys((*asked, *analysed.derivative_outputs(asked)))]
+        job = resolve(load_scene(tree))
     limit = None if amplitude is None else Limit.from_text(job.scene.system, amplitude)
     result = _result(job, _compute(job))
     if sensitivities:
-        # Local import: a point without sensitivities needs no atlas.
-        from drivetrain_jax.runs.reply import gradient_lines, point_sensitivities
-
-        physical = {name: value for name, (value, _) in result.physical.items()}
-        effects = (
-            point_sensitivities(job.scene.system, result.parameters, physical) if result.outcome.has_value else None
-        )
-        result = replace(result, sensitivities=effects or [], _effects=gradient_lines(effects))
+        result = _with_sensitivities(result, replace(job.scene.request, outputs=asked), job.scene, given)
     return result if limit is None else replace(result, forced=_forced(result, given, limit))
+
+
+def _with_sensitivities(result: PointResult, request: Request, scene: Scene, given: Iterable[str]) -> PointResult:
+    """The ``result`` with the sensitivities of the requested results, which its other values served."""
+    effects, known = [], described(scene.system)
+    if result.outcome.has_value:
+        data = {n: _in_units(x, units, known[n].units) for n, (x, units) in result.physical.items()}
+        asked = replace(scene, request=request)
+        effects = point_sensitivities(asked, given, data, result.parameters, result.values)
+    shown = differentiable(scene.analysis, request.outputs)
+    lines = effect_lines(effects, shown, result.labels)
+    values = {name: x for name, x in result.values.items() if name in request.outputs}
+    return replace(result, values=values, sensitivities=effects, _effects=lines)
+
+
+def _in_units(value: Any, units: str, wanted: str) -> Any:
+    if units == wanted or isinstance(value, str):
+        return value
+    return value * _units.factor(units, wanted)
 
 
 def _forced(result: PointResult, given: Mapping[str, Any], limit: Limit) -> tuple[str, dict[str, Any]]:
@@ -334,7 +365,7 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
         advice=scene.analysis.advice(scene.request),
         growth=grows,
         orders=orders,
-        sentence=sentence or (orders.sentence(values, float(ordered.get("speed", 0.0))) if orders else ""),
+        sentence=sentence or (orders.sentence(values, ordered) if orders else ""),
     )
 
 
@@ -384,9 +415,9 @@ class OrderCrossings:
         how = ", with the gyroscopic effect" if self.turning else ""
         return [f"  speed of the {self.orders.shaft} at which an order meets the mode{how}", *aligned([head, *modes])]
 
-    def sentence(self, values: Mapping[str, Any], speed: float) -> str:
-        """Whirl at the ``speed`` [rad/s] and critical speeds; else of ``values`` the speeds within the operating range or
-        the first ones, and the modes too near to that range."""
+    def sentence(self, values: Mapping[str, Any], parameters: Mapping[str, Any]) -> str:
+        """Whirl at the speed of the ``parameters`` and critical speeds; of other ``values`` the speeds within the operating
+        range or the first ones, and the modes too near to that range."""
         if "whirl_frequency" in values:
             codes, turns = values.get("whirl_direction"), values["whirl_frequency"] * 60 / (2 * math.pi)
             senses = (
@@ -394,9 +425,8 @@ class OrderCrossings:
             )
             said = [f"{sense} {_first(turns[which])}" for sense, which in senses.items() if np.any(which)]
             critical = [f"of {name}: {_first(column)}" for name, column in self.columns.items() if np.any(column > 0)]
-            whirl = (
-                f"At {speed * 60 / (2 * math.pi):.6g} rpm the shaft whirls {', '.join(said) or f'at {_first(turns)}'}"
-            )
+            speed = parameters.get("speed", 0.0) * 60 / (2 * math.pi)
+            whirl = f"At {speed:.6g} rpm the shaft whirls {', '.join(said) or f'at {_first(turns)}'}"
             return f"{whirl}; critical speeds {'; '.join(critical)}." if critical else f"{whirl}."
         if not self.operating:
             (name, column), *_ = self.columns.items()

@@ -8,25 +8,23 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from drivetrain_jax import _units
-from drivetrain_jax._errors import InputError, shown
-from drivetrain_jax._programs import compiled, program_identity
-from drivetrain_jax._quantities import Parameter
-from drivetrain_jax.analysis import get_analysis
-from drivetrain_jax.analysis._base import checked, make_request
+from drivetrain_jax._errors import InputError, aligned, shown
+from drivetrain_jax._quantities import Parameter, Variable
+from drivetrain_jax.analyses import jacobians
+from drivetrain_jax.analysis import Analysis
+from drivetrain_jax.analysis._base import checked
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
-from drivetrain_jax.analysis.numerics.kernels import options_for_few
-from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.runs.physical import GivenData, described
-from drivetrain_jax.runs.scene import find_system
+from drivetrain_jax.runs.scene import Scene
 from drivetrain_jax.systems import System
 
 if TYPE_CHECKING:
@@ -173,12 +171,14 @@ _ROUNDING = 1e-9
 
 
 class Sensitivity(NamedTuple):
-    """The ``slope`` of an answer by the datum ``name`` in its ``units``, and its change for one more ``percent``."""
+    """The ``slope`` of the answer ``output`` by the datum ``name`` in its ``units``, and its change for one ``percent``
+    more; both are arrays for an answer with a dimension."""
 
     name: str
     units: str
-    slope: float
-    percent: float
+    slope: Any
+    percent: Any
+    output: str = "spectral_radius"
 
 
 def radius_sensitivities(asked: AtlasQuery, slopes: Mapping[str, float]) -> list[Sensitivity]:
@@ -187,14 +187,65 @@ def radius_sensitivities(asked: AtlasQuery, slopes: Mapping[str, float]) -> list
     return _of_radius(asked.atlas.scene.system, asked.shaft, point, slopes)
 
 
+def differentiable(analysis: Analysis, outputs: Iterable[str]) -> list[Variable]:
+    """The results among ``outputs`` that may have derivatives and a table: numbers with at most one dimension."""
+    known = [analysis.variable(name) for name in outputs]
+    return [
+        v
+        for v in known
+        if v.dtype == "float64" and len(v.dims) < 2 and not v.name.endswith(("_error", "_residual", "_margin"))
+    ]
+
+
 def point_sensitivities(
-    system: type[System], point: Mapping[str, Any], physical: Mapping[str, Any]
-) -> list[Sensitivity] | None:
-    """Sensitivities of the spectral radius at a ``point`` (parameters) that follows from ``physical`` data, if any; None
-    without a gradient."""
-    slopes = radius_gradient(system, point)
-    shaft = GivenData(system.physical, physical) if physical and system.physical else None
-    return None if slopes is None else _of_radius(system, shaft, point, slopes)
+    scene: Scene,
+    given: Iterable[str],
+    physical: Mapping[str, Any],
+    parameters: Mapping[str, Any],
+    values: Mapping[str, Any],
+) -> list[Sensitivity]:
+    """Sensitivities of the results ``values`` of a point, by result, largest effect first: by the ``given`` names and by
+    parameters that do not follow from them. ``physical`` are the data in their units; numbers of 0 have none."""
+    system, names = scene.system, [v.name for v in differentiable(scene.analysis, scene.request.outputs)]
+    options = {**scene.request.options, "method": scene.request.method}
+    keys, found = jacobians(scene.analysis.name, system.of(parameters), names, options, values, hold=True)
+    known = described(system)
+    pool = {name: {**parameters, **physical}[name] for name in given if name in known}
+    follow = system.physical.converted(pool) if system.physical else {}
+    data = {name: x for name, x in parameters.items() if name not in follow} | pool
+    real = {
+        n: x for n, x in data.items() if known[n].units and not (known[n].integer or known[n].choices or known[n].text)
+    }
+    leaves = [(n, i, y) for n, x in real.items() for i, y in (enumerate(x) if isinstance(x, tuple) else [(None, x)])]
+    leaves = [(name, entry, float(x)) for name, entry, x in leaves if x and np.isfinite(x)]
+
+    def entries(x: Any) -> Any:
+        """The parameters of ``keys`` at the values ``x`` of ``leaves``."""
+        everything: dict[str, Any] = {name: list(y) if isinstance(y, tuple) else y for name, y in data.items()}
+        for (name, entry, _), y in zip(leaves, x, strict=True):
+            if entry is None:
+                everything[name] = y
+            else:
+                everything[name][entry] = y
+        everything = {name: tuple(y) if isinstance(y, list) else y for name, y in everything.items()}
+        if system.physical:
+            everything |= system.physical.converted({name: everything[name] for name in pool})
+        return jnp.stack([everything[name] if entry is None else everything[name][entry] for name, entry in keys])
+
+    x = np.array([x for *_, x in leaves])
+    chain = np.asarray(jax.jacfwd(entries)(x))
+    effects = []
+    for output, jacobian in found.items():
+        # A derivative that does not exist affects only the data on which its parameter depends.
+        slopes = np.where(chain == 0, 0.0, jacobian[..., None] * chain).sum(axis=-2)
+        of_output = [
+            Sensitivity(
+                name if entry is None else f"{name}[{entry}]", known[name].units, slope, slope * value / 100, output
+            )
+            for (name, entry, value), slope in zip(leaves, np.moveaxis(slopes, -1, 0), strict=True)
+        ]
+        effects += sorted(of_output, key=lambda effect: -np.max(np.abs(np.nan_to_num(effect.percent))))
+    return effects
 
 
 def _of_radius(
@@ -262,21 +313,46 @@ def _of_data(
     return sorted(sensitivities, key=lambda rule: -abs(rule.percent))
 
 
-def gradient_lines(sensitivities: list[Sensitivity] | None) -> list[str]:
-    """The sensitivities of the spectral radius as text."""
-    if sensitivities is None:
-        return [
-            "gradient of spectral_radius",
-            "  none: two multipliers have the largest modulus, within the errors, or it cannot be computed",
-        ]
+def gradient_lines(sensitivities: Sequence[Sensitivity] | None, output: str = "spectral_radius") -> list[str]:
+    """The sensitivities of a number as text."""
+    if not sensitivities or not np.isfinite([effect.slope for effect in sensitivities]).any():
+        why = "two multipliers have the largest modulus, within the errors, or it cannot be computed"
+        why = why if output == "spectral_radius" else "it has no derivative at this point"
+        return [f"gradient of {output}", f"  none: {why}"]
+    least = _ROUNDING * max(abs(np.nan_to_num(effect.percent)) for effect in sensitivities)
     return [
-        "gradient of spectral_radius, largest effect of 1 % first",
+        f"gradient of {output}, largest effect of 1 % first",
         *(
             f"  {effect.name:<24} {effect.percent:+.6g} for +1 %, {effect.slope:.6g}"
             f"{'' if effect.units == '1' else f' per {effect.units}'}"
             for effect in sensitivities
+            if not abs(effect.percent) <= least
         ),
     ]
+
+
+def effect_lines(
+    sensitivities: Sequence[Sensitivity], variables: Sequence[Variable], labels: Mapping[str, Sequence[Any]]
+) -> list[str]:
+    """The sensitivities of several results as text: a table for one with a dimension, whose entries ``labels`` name."""
+    lines = []
+    for variable in variables:
+        effects = [effect for effect in sensitivities if effect.output == variable.name]
+        if not variable.dims:
+            lines += gradient_lines(effects, variable.name)
+            continue
+        changes = np.array([effect.percent for effect in effects])
+        least = _ROUNDING * np.max(np.abs(np.nan_to_num(changes)), initial=0.0)
+        rows = [
+            [effect.name, *(f"{x:+.4g}" if np.isfinite(x) else "-" for x in row)]
+            for effect, row in zip(effects, changes, strict=True)
+            if np.any(np.abs(row) > least)
+        ]
+        (dim,), unit = variable.dims, "" if variable.units == "1" else f" [{variable.units}]"
+        head = [dim, *map(str, labels[dim])]
+        lines += [f"change of {variable.name}{unit} for +1 % of a value, largest first"]
+        lines += aligned([head, *rows]) if rows else ["  none: it has no derivative at this point"]
+    return lines
 
 
 def limit_line(asked: AtlasQuery, parameter: str, limit: Crossing | None, before: str = "") -> tuple[str, list[Any]]:
@@ -291,33 +367,17 @@ def limit_line(asked: AtlasQuery, parameter: str, limit: Crossing | None, before
         f"{effect.name} {effect.percent:+.3g}" for effect in sensitivities if abs(effect.percent) > least
     )
     unit = "" if units == "1" else f" [{units}]"
-    return f"{before}+1 % of a value changes {name} by{unit}: {changes}", [x._asdict() for x in sensitivities]
+    return f"{before}+1 % of a value changes {name} by{unit}: {changes}", [
+        x._replace(output=name)._asdict() for x in sensitivities
+    ]
 
 
 def radius_gradient(system: type[System], values: Mapping[str, float]) -> dict[str, float] | None:
     """Derivatives of the spectral radius by all parameters of ``system`` at ``values``, integers apart; None without any."""
-    names = system.models["floquet"].parameters
-    gradient = np.asarray(_compiled_gradient(system, names)({name: np.float64(values[name]) for name in names}))
-    # JAX orders the leaves of a dictionary by key.
-    slopes = dict(zip(sorted(names), map(float, gradient), strict=True))
-    real = [name for name in names if not system.parameter(name).integer]
+    keys, found = jacobians("floquet", system.of(values), ["spectral_radius"], {}, {}, hold=False)
+    slopes = {name: float(x) for (name, _), x in zip(keys, found["spectral_radius"], strict=True)}
+    real = [name for name in system.models["floquet"].parameters if not system.parameter(name).integer]
     return {name: slopes[name] for name in real} if np.isfinite([slopes[name] for name in real]).all() else None
-
-
-@lru_cache(maxsize=8)
-def _compiled_gradient(system: type[System], names: tuple[str, ...]) -> Callable[[dict[str, float]], jax.Array]:
-    """The derivative rule of :func:`~drivetrain_jax.floquet` alone: tracing the value as well takes twice the time."""
-    analysis = get_analysis("floquet").for_system(system)
-    request = make_request(system, analysis, ["spectral_radius"], {})
-
-    def slopes(parameters: dict[str, jax.Array]) -> jax.Array:
-        assert analysis.derivatives is not None
-        constants = Constants(dict.fromkeys(names))
-        return analysis.derivatives(system, request, parameters, constants, {})["spectral_radius"]
-
-    kinds = ({name: np.float64(0.0) for name in names},)
-    identity = program_identity(system, analysis, "gradient") if find_system(system.name) is system else ""
-    return compiled(slopes, kinds, options_for_few(), identity)
 
 
 # Samples of a range of speeds: evenly spaced, and halving distances from both ends, where a resonance may lie.

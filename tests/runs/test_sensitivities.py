@@ -123,6 +123,56 @@ def test_a_point_gives_sensitivities_by_its_physical_data_when_asked(capsys):
     assert main(command) == 0
     assert f"  {found[0]['name']}" in capsys.readouterr().out.split("largest effect of 1 % first\n")[1].splitlines()[0]
     assert dt.point("cardan", "floquet", **point).sensitivities is None
-    with pytest.raises(dt.InputError, match=r"^sensitivities: bicardan has no spectral radius"):
-        shaft = {"length": [0.3, 0.3], "EI": [1e4, 1e4], "rhoA": [15.0, 15.0], "k_A": 1e6, "k_D": 1e6}
-        dt.point("bicardan", "critical_speeds", modes=1, sensitivities=True, **shaft)
+
+
+LINE = {"speed": 100.0, "k": [1e4, 2e4], "c": [0.1, 0.1], "J": [0.1, 1.0]}
+SHAFT = {"length": [0.3, 0.9], "outer_diameter": [0.06, 0.08], "inner_diameter": [0.0, 0.07], "material": "steel"}
+OF_ANALYSES = [
+    ("driveline", "modes", "natural_frequency", LINE, ("k[1]", "J[0]")),
+    pytest.param(
+        *("bicardan", "critical_speeds", "critical_speed", SHAFT | {"k_A": 5e6, "k_D": 5e6, "modes": 2}),
+        ("outer_diameter[1]", "length[0]", "k_A"),
+        marks=pytest.mark.full,
+    ),
+    pytest.param(
+        "cardan", "forced", "amplitude", DATA | {"speed": 1200.0}, ("angle", "speed", "k2"), marks=pytest.mark.full
+    ),
+    pytest.param(
+        *("rattle", "steady_state", "u_max", dt.Rattle.presets["table1"] | {"omega": 0.7}),
+        ("omega", "B1"),
+        marks=pytest.mark.full,
+    ),
+]
+
+
+@pytest.mark.parametrize(("system", "analysis", "output", "given", "names"), OF_ANALYSES)
+def test_sensitivities_of_any_result_are_central_differences(system, analysis, output, given, names):
+    def changed(name, step):
+        name, _, entry = name.partition("[")
+        value = given[name]
+        if entry:
+            value = [x * (1 + step) if k == int(entry[:-1]) else x for k, x in enumerate(value)]
+        else:
+            value *= 1 + step
+        return np.asarray(dt.point(system, analysis, outputs=[output], **given | {name: value})[output])
+
+    found = dt.point(system, analysis, outputs=[output], sensitivities=True, **given)
+    effects = {effect.name: effect for effect in found.sensitivities}
+    assert {effect.output for effect in found.sensitivities} == {output} and list(found) == [output]
+    for name in names:
+        difference = (changed(name, 1e-5) - changed(name, -1e-5)) / 2e-3
+        np.testing.assert_allclose(effects[name].percent, difference, rtol=1e-5, atol=1e-9 * np.max(found[output]))
+    told = f"change of {output}" if np.ndim(found[output]) else f"gradient of {output}"
+    assert told in repr(found) and json.loads(found.to_json())["sensitivities"][0]["output"] == output
+
+
+@pytest.mark.parametrize(
+    ("analysis", "options", "message"),
+    [
+        ("lyapunov", {}, "sensitivities: lyapunov has no derivatives; expected floquet or history or forced"),
+        ("floquet", {"outputs": ["verdict"]}, r"outputs = \['verdict'\]: without sensitivities; expected one of"),
+    ],
+)
+def test_sensitivities_without_a_derivative_are_refused(analysis, options, message):
+    with pytest.raises(dt.InputError, match=f"^{message}"):
+        dt.point("cardan", analysis, **DATA, speed=1200.0, sensitivities=True, **options)
