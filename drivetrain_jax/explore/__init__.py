@@ -66,12 +66,13 @@ def pack(stored: StoredAtlas) -> dict[str, Any]:
     return {
         "title": scene.title,
         "system": {"name": system.name, "title": system.title},
-        "parameters": [_parameter(atlas, system, k) for k in range(len(atlas.parameters))],
+        "parameters": [_parameter(stored, k) for k in range(len(atlas.parameters))],
         "fixed": {
             name: _fixed(system, shaft, name, value)
             for name, value in scene.fixed.items()
             if name not in atlas.parameters
         },
+        "given": _given(stored),
         "units": _units(system, shaft),
         "rtol": stability.rtol,
         "proof": "verdicts hold by estimate; drivetrain query says which are proved"
@@ -96,7 +97,8 @@ def encoded(values: Any) -> str:
     return base64.b64encode(np.ascontiguousarray(values, "<f8").tobytes()).decode()
 
 
-def _parameter(atlas: Atlas, system: type[System], k: int) -> dict[str, Any]:
+def _parameter(stored: StoredAtlas, k: int) -> dict[str, Any]:
+    atlas, system = stored.stability.atlas, stored.scene.system
     described = system.parameter(atlas.parameters[k])
     lower, upper = float(atlas.lower[k]), float(atlas.upper[k])
     return {
@@ -109,7 +111,23 @@ def _parameter(atlas: Atlas, system: type[System], k: int) -> dict[str, Any]:
         "form": _form_of(atlas.coordinates[k], described.name, lower, upper),
         "even": atlas.coordinates[k].even,
         "role": next((role for role, name in system.roles.items() if name == described.name), ""),
+        "view": _view(stored, described.name),
     }
+
+
+def _view(stored: StoredAtlas, name: str) -> dict[str, Any] | None:
+    """The physical quantity that readers see for a parameter, and its value where the parameter is 1; None without one.
+
+    Angles have units of their own on the page.
+    """
+    known = stored.views.get(name) or (stored.shaft.back(name) if stored.shaft else None)
+    if known is None or stored.scene.system.parameter(name).units == "rad":
+        return None
+    quantity, convert = known
+    factor, ends = float(convert(1.0)), np.array(stored.ranges[name])
+    if not np.allclose(convert(ends), factor * ends, rtol=1e-12):
+        return None
+    return {"symbol": quantity.name, "units": quantity.units, "long_name": quantity.long_name, "factor": factor}
 
 
 def _form_of(coordinate: Coordinate, name: str, lower: float, upper: float) -> str:
@@ -124,14 +142,21 @@ def _form_of(coordinate: Coordinate, name: str, lower: float, upper: float) -> s
     )
 
 
-def _fixed(system: type[System], shaft: GivenData | None, name: str, value: Any) -> dict[str, Any]:
-    """A fixed value as in a scene (``text``), and as readers see it (``shown``): as physical data if these are known."""
-    # JSON has no infinity.
-    text = str(value) if isinstance(value, float) else json.dumps(value)
+def _fixed(system: type[System], shaft: GivenData | None, name: str, value: Any) -> str:
+    """A fixed value as readers see it: as physical data if these are known."""
     known = shaft.quantity(name, value) if shaft and isinstance(value, float) else None
     label, number, units = known or (name, value, system.parameter(name).units)
-    shown = f"{number:.6g}" if isinstance(number, float) else text
-    return {"text": text, "shown": f"{label} = {shown}{'' if units == '1' else f' {units}'}"}
+    shown = f"{number:.6g}" if isinstance(number, float) else json.dumps(value)
+    return f"{label} = {shown}{'' if units == '1' else f' {units}'}"
+
+
+def _given(stored: StoredAtlas) -> dict[str, str]:
+    """The fixed values as a scene gives them: physical data, and parameters that do not follow from these."""
+    scene, physical = stored.scene, stored.scene.system.physical
+    follow = physical.converted(scene.data) if physical and scene.data else {}
+    fixed = {n: x for n, x in scene.fixed.items() if n not in stored.parameters and n not in follow}
+    # JSON has no infinity.
+    return {n: str(x) if isinstance(x, float) else json.dumps(x) for n, x in {**scene.data, **fixed}.items()}
 
 
 def _units(system: type[System], shaft: GivenData | None) -> dict[str, Any]:

@@ -53,10 +53,10 @@ const start = () => {
     speed: atlas.parameters.findIndex((p) => p.role === "speed"),
     theme: () => (dark.matches && !app.printing ? "dark" : "light"),
     caption: (k) => {
-      const { symbol, long_name: name } = atlas.parameters[k];
-      // In rpm it is the speed itself, not its ratio to a frequency.
-      return unitOf(atlas.parameters[k], app.state.units).unit === "rpm" ? name.split(" over ")[0] : `${symbol}, ${name}`;
+      const { symbol, name, unit } = unitOf(atlas.parameters[k], app.state.units);
+      return unit === "rpm" ? name : `${symbol}, ${name}`;
     },
+    symbol: (k) => unitOf(atlas.parameters[k], app.state.units).symbol,
     written: (k, value) => {
       const { unit, factor } = unitOf(atlas.parameters[k], app.state.units);
       return shown(value * factor, 6) + (unit === "°" ? unit : unit && ` ${unit}`);
@@ -211,7 +211,7 @@ function drawing(app) {
 function buildControls(app) {
   const { atlas } = app, changeTo = (id, edit, whole = true) => get(id).addEventListener("change", () => app.change((state) => edit(state, get(id)), whole && "whole"));
   get("title").textContent = atlas.title || atlas.system.title;
-  get("about").textContent = [atlas.system.title, ...Object.values(atlas.fixed).map(({ shown }) => shown)].join(", ") + `; ${atlas.proof}.`;
+  get("about").textContent = [atlas.system.title, ...Object.values(atlas.fixed)].join(", ") + `; ${atlas.proof}.`;
   for (const id of ["across", "up"]) get(id).append(...atlas.parameters.map((p, k) => new Option(app.caption(k), p.name)));
   const swap = (state, at, name) => {
     const k = atlas.parameters.findIndex((p) => p.name === name), other = state.axes.length - 1 - at;
@@ -233,6 +233,12 @@ function buildControls(app) {
   get("up-label").hidden = atlas.parameters.length < 2;
   get("angle-label").hidden = !atlas.parameters.some((p) => p.units === "rad");
   for (const label of document.querySelectorAll(".speed")) label.hidden = app.speed < 0 || atlas.parameters[app.speed].units !== "1";
+  const speed = atlas.parameters[app.speed]?.view;
+  if (speed) {
+    // A file with the shaft's data needs no more.
+    for (const id of ["J", "k"]) get(id).parentElement.hidden = true;
+    get("speed").options[1].textContent = speed.units;
+  }
   get("band-label").hidden = app.speed < 0;
   buildExports(app);
 }
@@ -251,8 +257,9 @@ function buildParameters(app) {
     const row = document.createElement("div"), name = document.createElement("div"), axis = state.axes.includes(k);
     row.className = "parameter";
     name.className = "name";
-    name.textContent = `${parameter.symbol} `;
-    name.append(Object.assign(document.createElement("small"), { textContent: parameter.long_name }));
+    const seen = unitOf(parameter, state.units);
+    name.textContent = `${seen.symbol} `;
+    name.append(Object.assign(document.createElement("small"), { textContent: seen.name + (seen.unit && ` [${seen.unit}]`) }));
     row.append(name);
     state.panes.slice(0, axis ? 1 : 2).forEach((_, number) => row.append(...slider(app, k, number, axis)));
     if (axis) row.append(viewFields(app, k));
@@ -261,7 +268,7 @@ function buildParameters(app) {
 }
 
 function slider(app, k, number, axis) {
-  const parameter = app.atlas.parameters[k], label = `${parameter.long_name}${app.state.panes.length > 1 && !axis ? `, chart ${"AB"[number]}` : ""}`;
+  const parameter = app.atlas.parameters[k], label = `${unitOf(parameter, app.state.units).name}${app.state.panes.length > 1 && !axis ? `, chart ${"AB"[number]}` : ""}`;
   const range = Object.assign(document.createElement("input"), { type: "range", min: 0, max: 1, step: "any", ariaLabel: label });
   const field = Object.assign(document.createElement("input"), { ariaLabel: `${label}, number`, inputMode: "decimal" });
   const set = (value) => app.change((state) => state.panes.forEach((pane, i) => (axis || i === number) && (pane.values[k] = value)), !axis);
@@ -281,7 +288,7 @@ function viewFields(app, k) {
   const parameter = app.atlas.parameters[k], view = document.createElement("div");
   view.className = "view";
   const fields = ["lower", "upper"].map((end) => {
-    const field = Object.assign(document.createElement("input"), { ariaLabel: `${parameter.long_name}, ${end} end of the view`, inputMode: "decimal", size: 8 });
+    const field = Object.assign(document.createElement("input"), { ariaLabel: `${unitOf(parameter, app.state.units).name}, ${end} end of the view`, inputMode: "decimal", size: 8 });
     field.dataset.view = `${k} ${end}`;
     field.style.width = "6.5em";
     field.addEventListener("change", () => {
@@ -340,8 +347,8 @@ function buildExports(app) {
     setTimeout(() => URL.revokeObjectURL(link.href), 1e4);
     say(`${name} written`);
   };
-  const scene = () => sceneText(atlas, { axes: app.state.axes, values: app.state.panes[0].values, lower: app.state.lower, upper: app.state.upper });
-  const command = () => commandText(atlas, app.state.panes[0].values);
+  const scene = () => sceneText(atlas, { axes: app.state.axes, values: app.state.panes[0].values, lower: app.state.lower, upper: app.state.upper, units: app.state.units });
+  const command = () => commandText(atlas, app.state.panes[0].values, app.state.units);
   get("scene").addEventListener("click", () => copy(scene(), "scene"));
   get("command").addEventListener("click", () => copy(command(), "command"));
   get("link").addEventListener("click", () => copy(`${location.href.split("#")[0]}#${toHash(atlas, app.state)}`, "address"));

@@ -132,7 +132,7 @@ function context(canvas, width, height) {
 
 function describe(app, pane, theme, growth) {
   const { state } = app, own = state.panes[pane.number];
-  const others = app.atlas.parameters.map((p, k) => (state.axes.includes(k) ? "" : `${p.symbol} = ${app.written(k, own.values[k])}`)).filter(Boolean);
+  const others = app.atlas.parameters.map((p, k) => (state.axes.includes(k) ? "" : `${app.symbol(k)} = ${app.written(k, own.values[k])}`)).filter(Boolean);
   pane.heading.textContent = [state.panes.length > 1 ? "AB"[pane.number] : "", others.join(", ")].filter(Boolean).join(": ");
   pane.map.value = own.map;
   const colours = growth ? [] : THEMES[theme].verdicts.slice(0, 3).map((c, i) => [`rgb(${c})`, ["stable", "unstable", "undecided"][i]]);
@@ -188,7 +188,7 @@ export function tell(app, pane) {
   const key = own.values.filter((_, k) => !app.state.axes.includes(k)).join() + app.state.axes;
   if (pane.part?.key !== key) pane.part = Object.assign(slice(app.atlas, own.values, app.state.axes), { key });
   const found = atPoint(pane.part, point), rows = [];
-  rows.push(["at", app.state.axes.map((k) => `${app.atlas.parameters[k].symbol} = ${app.written(k, values[k])}`).reverse().join(", ")]);
+  rows.push(["at", app.state.axes.map((k) => `${app.symbol(k)} = ${app.written(k, values[k])}`).reverse().join(", ")]);
   rows.push(["verdict", found.covered ? WORDS[found.verdict] : "not covered: no panel here"]);
   rows.push(["spectral radius", `${shown(found.spectral_radius, 10)} ± ${shown(found.spectral_radius_error, 2)}`]);
   rows.push(["growth per period", shown(Math.log(found.spectral_radius), 6)]);
@@ -196,7 +196,7 @@ export function tell(app, pane) {
   if (Number.isFinite(rate)) rows.push(["growth per second", `${shown(rate, 6)} 1/s`]);
   else if (!baseFrequency(app.state.units) && app.speed >= 0) rows.push(["growth per second", "give J and k"]);
   const near = own.nearest;
-  if (near && !app.hover) near.forEach((each, k) => rows.push([`nearest change along ${app.atlas.parameters[k].symbol}`, distances(app, each, k, values[k])]));
+  if (near && !app.hover) near.forEach((each, k) => rows.push([`nearest change along ${app.symbol(k)}`, distances(app, each, k, values[k])]));
   pane.readout.replaceChildren(...rows.map(([name, text]) => create("tr", {}, create("th", { scope: "row" }, name), create("td", {}, text))));
 }
 

@@ -14,13 +14,16 @@ export function labelText(label) {
   return parts[1] + sign + [...parts[3]].map((digit) => "₀₁₂₃₄₅₆₇₈₉"[digit]).join("");
 }
 
-/** The unit in which a parameter is shown, and the factor from the atlas's number to the reader's. */
+/** Symbol, meaning and unit under which a parameter is shown, and the factor from the atlas's number to the reader's. */
 export function unitOf(parameter, units) {
-  if (parameter.units === "rad" && units.angle === "deg") return { unit: "°", factor: 180 / Math.PI };
+  const { symbol, long_name: name, view } = parameter, speed = parameter.role === "speed";
+  if (parameter.units === "rad" && units.angle === "deg") return { symbol, name, unit: "°", factor: 180 / Math.PI };
+  if (view && (!speed || units.speed === "rpm")) return { symbol: view.symbol, name: view.long_name, unit: view.units === "1" ? "" : view.units, factor: view.factor };
   const base = baseFrequency(units);
-  if (parameter.role === "speed" && parameter.units === "1" && units.speed === "rpm" && base)
-    return { unit: "rpm", factor: (base * 30) / Math.PI };
-  return { unit: parameter.units === "1" ? "" : parameter.units, factor: 1 };
+  if (speed && parameter.units === "1" && units.speed === "rpm" && base)
+    // In rpm it is the speed itself, not its ratio to a frequency.
+    return { symbol: "speed", name: name.split(" over ")[0], unit: "rpm", factor: (base * 30) / Math.PI };
+  return { symbol, name, unit: parameter.units === "1" ? "" : parameter.units, factor: 1 };
 }
 
 /** sqrt(k/J) in rad/s of the numbers that the reader has given, NaN without them. */
@@ -38,26 +41,32 @@ export function growthPerSecond(atlas, values, rho, units) {
 }
 
 const number = (value) => (Number.isInteger(value) && Math.abs(value) < 1e15 ? `${value}.0` : String(value));
+// Name and value of a parameter as a scene gives them, with the digits of a slider.
+const given = ({ name, units: own, view }, value, units) => {
+  if (view) return [view.symbol, `${shown(value * view.factor, 12)}${view.units === "1" ? "" : ` ${view.units}`}`];
+  return [name, own === "rad" && units.angle === "deg" ? `${shown((value * 180) / Math.PI, 12)} deg` : Number(value.toPrecision(12))];
+};
+const entry = (value) => (typeof value === "string" ? quoted(value) : number(value));
 // TOML has the escapes of JSON, and one control character more to escape.
 const quoted = (text) => JSON.stringify(text).replaceAll("\u007f", "\\u007f");
 // Words within single quotes reach a command as they are.
 const word = (text) => (/^[\w.+=:-]+$/.test(text) ? text : `'${text.replaceAll("'", `'\\''`)}'`);
 
 /** The visible chart as a scene of the analysis `floquet`, with `num` values an axis. */
-export function sceneText(atlas, { axes, values, lower, upper }, num = 201) {
+export function sceneText(atlas, { axes, values, lower, upper, units }, num = 201) {
   const lines = [`title = ${quoted(atlas.title || "")}`, `system = ${quoted(atlas.system.name)}`, 'analysis = "floquet"', "", "[axes]"];
-  for (const k of axes) lines.push(`${atlas.parameters[k].name} = { start = ${number(lower[k])}, stop = ${number(upper[k])}, num = ${num} }`);
+  const written = (k, value) => given(atlas.parameters[k], value, units), said = (k, value) => entry(written(k, value)[1]);
+  for (const k of axes) lines.push(`${written(k, lower[k])[0]} = { start = ${said(k, lower[k])}, stop = ${said(k, upper[k])}, num = ${num} }`);
   lines.push("", "[fixed]");
-  atlas.parameters.forEach((p, k) => axes.includes(k) || lines.push(`${p.name} = ${number(values[k])}`));
-  for (const [name, { text }] of Object.entries(atlas.fixed)) lines.push(`${name} = ${text}`);
+  values.forEach((value, k) => axes.includes(k) || lines.push(`${written(k, value)[0]} = ${said(k, value)}`));
+  for (const [name, text] of Object.entries(atlas.given)) lines.push(`${name} = ${text}`);
   return [...lines, "", "[options]", `rtol = ${number(atlas.rtol)}`, ""].join("\n");
 }
 
 /** The command that solves one point directly. */
-export function commandText(atlas, values) {
-  const given = atlas.parameters.map((p, k) => `${p.name}=${values[k]}`);
-  for (const [name, { text }] of Object.entries(atlas.fixed)) given.push(`${name}=${text}`);
-  return ["drivetrain", "point", atlas.system.name, "floquet", ...given].map(word).join(" ");
+export function commandText(atlas, values, units) {
+  const words = [...atlas.parameters.map((p, k) => given(p, values[k], units)), ...Object.entries(atlas.given)].map(([name, value]) => `${name}=${value}`);
+  return ["drivetrain", "point", atlas.system.name, "floquet", ...words].map(word).join(" ");
 }
 
 const VERDICTS = ["stable", "unstable", "undecided", "not covered"];

@@ -161,8 +161,9 @@ def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, A
     title = table.title or f"{system.title}: {analysis.title}"
     scene = Scene(system, analysis, request, axes, zipped, fixed, title, text, data)
     if several := next((axis for axis in axes if axis.also and analysis.continuous), None):
-        names = ", ".join(part.name for part in several.together)
-        allowed = "allowed in an atlas is one: fix the others in place of their data"
+        names = " and ".join(part.name for part in several.together)
+        others = ", ".join(axis.name for axis in several.also)
+        allowed = f"expected an atlas over one of them: fix {others} in place of the data behind"
         raise InputError(f"axes.{several.shown.name}: changes {names} together; {allowed}")
     _check_path(scene)
     # The analysis checks that request and parameters match.

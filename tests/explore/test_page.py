@@ -118,6 +118,13 @@ def test_the_page_begins_with_the_data_that_the_file_knows(tmp_path):
         and "k2 = 40000 N m/rad" in told["fixed"]
         and "J=" not in told["state"]["hash"]
     )
+    assert [(seen["symbol"], seen["unit"]) for seen in told["seen"]] == [("speed", "Hz"), ("c1", "N m s/rad")]
+    assert [seen["factor"] for seen in told["seen"]] == pytest.approx([(6e4 / 2) ** 0.5 / (2 * np.pi), 2 * 12e4**0.5])
+    # A copied scene is that of the data sheet.
+    scene = tomllib.loads(told["scene"])
+    assert scene["fixed"] == SHAFT["fixed"]
+    assert scene["axes"] == {name: {**ends, "num": 5} for name, ends in SHAFT["axes"].items()}
+    assert "'speed=23.5 Hz'" in told["command"] and "angle=12.0" in told["command"]
     other = texts(tmp_path / "page.html", "angle=rad&speed=1&J=3")["state"]
     assert other["units"] == {"angle": "rad", "speed": "1", "J": 3, "k": 6e4}
     assert {"angle=rad", "speed=1", "J=3"} <= set(other["hash"].split("&"))

@@ -4,7 +4,7 @@ import { THEMES, boundary, growthColour, pixels, resonances, tickText, ticks } f
 import { openAtlas, slice } from "../../drivetrain_jax/explore/evaluate.js";
 import { onGrid } from "../../drivetrain_jax/explore/grid.js";
 import { marks, svg } from "../../drivetrain_jax/explore/marks.js";
-import { commandText, csvText, fromHash, labelText, sceneText, shown, toHash } from "../../drivetrain_jax/explore/text.js";
+import { commandText, csvText, fromHash, labelText, sceneText, shown, toHash, unitOf } from "../../drivetrain_jax/explore/text.js";
 
 const text = fs.readFileSync(process.argv[2], "utf8"), json = /<script type="application\/json" id="data">([^]*?)<\/script>/.exec(text)[1];
 const atlas = openAtlas(JSON.parse(json)), hash = process.argv[3] || "", n = 201;
@@ -15,10 +15,11 @@ const image = pixels(grid, "verdict", THEMES.light), growth = pixels(grid, "grow
 const label = '<script>alert("x")</script>', axis = { factor: 1, lower: 0, upper: 1, label };
 const list = marks({ axes: [axis, axis], segments: [0, 0, 1, 1], lines: [], bands: [], curve: null }, 600, 400, "light");
 process.stdout.write(JSON.stringify({
-  fixed: Object.values(atlas.fixed).map(({ shown }) => shown),
+  seen: atlas.parameters.map((p) => unitOf(p, state.units)),
+  fixed: Object.values(atlas.fixed),
   state: { ...state, hash: toHash(atlas, state) },
-  scene: sceneText(atlas, { axes: state.axes, values, lower: state.lower, upper: state.upper }, 5),
-  command: commandText(atlas, values),
+  scene: sceneText(atlas, { axes: state.axes, values, lower: state.lower, upper: state.upper, units: state.units }, 5),
+  command: commandText(atlas, values, state.units),
   csv: csvText(onGrid(slice(atlas, values, state.axes), xs.slice(0, 2), ys.slice(0, 2)), state.axes.map((k) => atlas.parameters[k].name), xs, ys).split("\n"),
   boundary: boundary(grid).map((v, i) => (i % 2 ? ys : xs)[0] + (v * ((i % 2 ? ys : xs)[n - 1] - (i % 2 ? ys : xs)[0])) / (n - 1)),
   corner: [...image.slice(0, 4)], bottom: [...image.slice(-4 * n, -4 * n + 4)], dark: growth.length,

@@ -146,7 +146,7 @@ def test_what_is_wrong_with_data_of_a_scene():
     ranges = {"c1": {"start": 0.1, "stop": 1}}
     fixed = {name: value for name, value in TRUCK.items() if name != "c1"} | {"angle": 3, "speed": 100}
     assert refused(cardan("atlas", axes=ranges, fixed=fixed)).startswith(
-        "axes.c1: changes zeta, alpha together; allowed in an atlas"
+        "axes.c1: changes zeta and alpha together; expected an atlas over one of them: fix alpha in place of the data behind"
     )
     with pytest.raises(dt.InputError, match=r"axes\.c1 changes zeta, alpha together; expected auto and direct"):
         dt.run(cardan(axes={"c1": [0.1, 0.2]}, fixed=fixed, options={"method": "atlas"}))
