@@ -486,6 +486,7 @@ def point(options: argparse.Namespace) -> int:
     from drivetrain_jax.runs.point import point
 
     values = assignments(options.given, "point")
+    pairs = {n: _number_or_range(n, v) for n, v in values.items() if isinstance(v, str) and ":" in v}
     asked = {"amplitude": options.amplitude, "sensitivities": options.sensitivities, "data": options.data}
     for name in ("system", "analysis", *asked):
         if name in values:
@@ -495,7 +496,7 @@ def point(options: argparse.Namespace) -> int:
     outputs = values.pop("outputs", None)
     if isinstance(outputs, str):
         outputs = outputs.split(",")
-    return _answer(point(options.system, options.analysis, outputs=outputs, **asked, **values), options)
+    return _answer(point(options.system, options.analysis, outputs=outputs, **asked, **values | pairs), options)
 
 
 def query(options: argparse.Namespace) -> int:

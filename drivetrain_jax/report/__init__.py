@@ -23,6 +23,7 @@ from drivetrain_jax.datasets.figure import drawn, in_physical_data
 from drivetrain_jax.report.statements import amplitudes, axes_table, fixed_table, statements, values_tables
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.consolidate import open_result
+from drivetrain_jax.view import charts
 from drivetrain_jax.view.style import allowed_units, in_units, listed, unit_of, with_prefixes, written_units
 
 if TYPE_CHECKING:
@@ -97,6 +98,13 @@ def _section(path: Path, number: int, asked: list[str], amplitude: Any) -> dict[
         answers, chart, compared = _atlas_answers(path, convert, amplitude)
     else:
         chart, compared = dataset.load(), False
+        if analysis == "floquet" and charts.sweep_axes(chart) == [charts.role(chart, "speed")]:
+            from drivetrain_jax.runs.reply import with_unstable_ranges
+            from drivetrain_jax.runs.scene import find_system
+
+            # Other systems have atlases for that.
+            atlas = "atlas" in find_system(str(attrs.get("system"))).models
+            chart = chart if atlas or "verdict" not in chart else with_unstable_ranges(chart)[0]
     if amplitude is not None and (analysis == "floquet" or amplitudes(chart)):
         from drivetrain_jax.runs.reply import Limit
         from drivetrain_jax.runs.scene import find_system

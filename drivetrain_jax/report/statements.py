@@ -25,6 +25,7 @@ from drivetrain_jax.view.style import (
     suitable,
     unit_of,
     units_of,
+    unstable_text,
     value_in,
     written_units,
 )
@@ -46,7 +47,9 @@ def statements(
     Forced amplitudes in ``moved`` (default: among the results) are compared with ``limit``.
     """
     coded = [v for v in _coded(dataset) if v.name != "outcome"]
-    said = [sentence for variable in coded for sentence in _about_codes(dataset, variable, ranges)]
+    exact = [unstable_text(dataset, str(dim)) for dim in dataset["outcome"].dims] if ranges else []
+    said = [f"{_capital(text)}." for text in exact if text]
+    said += [sentence for variable in coded for sentence in _about_codes(dataset, variable, ranges)]
     said += [f"{_capital(dataset.attrs['proof'])}."] if "proof" in dataset.attrs else []
     said += [*_about_growth(dataset), *(_about_limit(dataset if moved is None else moved, limit) if limit else ())]
     said += [sentence for variable in _numbers(dataset) for sentence in _about_numbers(dataset, variable)]
@@ -76,12 +79,16 @@ def _about_codes(dataset: xr.Dataset, variable: xr.DataArray, ranges: bool) -> I
     shares = {word.replace("_", " "): float(np.mean(variable.values == code)) for code, word in meanings.items()}
     yield f"{_capital(name)}: " + ", ".join(f"{word} {_share(share)}" for word, share in shares.items() if share) + "."
     axis = _main_axis(dataset, variable) if ranges else None
+    exact = axis is not None and f"unstable_{axis.name}" in dataset.coords
     if shares.get("undecided"):
         yield "Undecided points lie closer to the limit than their error bound: compute them again with a smaller rtol."
     if axis is None:
         return
     others = [dim for dim in variable.dims if dim != axis.name]
     for code, word in zip(meanings, shares, strict=True):
+        # The first sentence says the exact ranges.
+        if exact and word in ("stable", "unstable"):
+            continue
         everywhere = (variable == code).all(others) if others else variable == code
         if 0 < shares[word] < 1 and bool(everywhere.any()):
             names = " and ".join(scene_key(dataset[dim]) if dim in dataset.coords else str(dim) for dim in others)

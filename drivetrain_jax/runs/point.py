@@ -16,6 +16,7 @@ from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError, aligned, did_you_mean, meant, shown, written
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, get_analysis
+from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
 from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range, orders_of
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
@@ -34,6 +35,7 @@ from drivetrain_jax.runs.reply import (
 )
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import Scene, load_scene, system_and_analysis
+from drivetrain_jax.view.style import in_units, ranges_text, runs_text, units_of, unstable_text
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,8 @@ class PointResult:
     ``outcome`` is the outcome of the point (results are NaN unless ``outcome.has_value``), ``units`` the units by name,
     ``labels`` the entries of each dimension of the results, ``physical`` the given physical data and their units,
     ``growth`` what a spectral radius means: rate [1/s], factor per turn, time and turns to double or to halve,
-    ``sentence`` the answer of an analysis that has one,
+    ``sentence`` the answer of an analysis that has one, ``unstable`` the name of a parameter that was given as a range, and
+    its unstable ranges,
     ``sensitivities`` those of the results, largest effect of one percent first (None unless asked for).
     """
 
@@ -64,6 +67,7 @@ class PointResult:
     sentence: str = field(default="", repr=False)
     forced: tuple[str, Mapping[str, Any]] | None = field(default=None, repr=False)
     sensitivities: Sequence[Any] | None = field(default=None, repr=False)
+    unstable: tuple[str, Sequence[Any]] | None = field(default=None, repr=False)
     _effects: Sequence[str] = field(default=(), repr=False)
 
     @property
@@ -119,6 +123,7 @@ class PointResult:
             **({"growth": self.growth} if self.growth else {}),
             **({"forced": self.forced[1]} if self.forced else {}),
             **({} if effects is None else {"sensitivities": effects}),
+            **({"unstable": dict([self.unstable])} if self.unstable else {}),
             **({"crossings": crossings} if crossings else {}),
         }
         return Reply(self._lines(), answer, self.sentence)
@@ -228,7 +233,8 @@ def point(
         sensitivities: adds the effect of one percent of each value on the results, by the given physical data or parameters.
         data: a table of parameters (``.csv``, ``.xlsx``, ``.toml``), a column each with its unit (``length [mm]``).
         given: parameters of the system (or its physical data), and options of the analysis (``method``, ``rtol``, ...);
-            they override ``data``.
+            they override ``data``. Of ``floquet`` one may be a range, ``speed=("1500 rpm", "6000 rpm")``: the answer begins
+            with the unstable ranges in it, and the point is the one with the largest spectral radius.
 
     Raises: :class:`InputError` with one line that names the field, the value and what is allowed; :class:`ChunkError` if
     the computation fails.
@@ -240,6 +246,9 @@ def point(
     """
     if data is not None:
         given = read_table(Path(data)) | given
+    if (name := _varied(system, analysis, given)) is not None:
+        asked = {"outputs": outputs, "amplitude": amplitude, "sensitivities": sensitivities}
+        return _least_stable(system, name, given, asked)
     tree = _tree(system, analysis, {name: toml.plain(value) for name, value in given.items()})
     if outputs is not None:
         outputs = [outputs] if isinstance(outputs, str) else outputs
@@ -284,6 +293,39 @@ def _in_units(value: Any, units: str, wanted: str) -> Any:
     if units == wanted or isinstance(value, str):
         return value
     return value * _units.factor(units, wanted)
+
+
+def _varied(system: str, analysis: str, given: Mapping[str, Any]) -> str | None:
+    """The parameter that has a range, a pair, in a question about stability; None without one."""
+    known = described(system_and_analysis(system, analysis)[0]) if analysis == "floquet" else {}
+    pairs = (name for name, value in given.items() if isinstance(value, tuple) and len(value) == 2)
+    return next((name for name in pairs if name in known and known[name].is_number and not known[name].listed), None)
+
+
+def _least_stable(system: str, name: str, given: Mapping[str, Any], asked: Mapping[str, Any]) -> PointResult:
+    """The point of the largest spectral radius in the range of ``name``, and the unstable ranges as its sentence."""
+    from drivetrain_jax.runs.reply import with_unstable_ranges
+    from drivetrain_jax.runs.run import run
+
+    low, high = map(toml.plain, given[name])
+    given = {n: value for n, value in given.items() if n != name}
+    tree = _tree(system, "floquet", {n: toml.plain(value) for n, value in given.items()})
+    fixed = tree["fixed"] | {n: value for n, (value,) in tree.pop("points").items()}
+    axes = {name: {"start": low, "stop": high, "num": _RANGE}}
+    dataset = run(tree | {"fixed": fixed, "axes": axes, "outputs": ["spectral_radius", "verdict"]})
+    unit = next((parts[1] for end in (low, high) if isinstance(end, str) and (parts := _units.split(end))), "")
+    dataset, worst = with_unstable_ranges(dataset)
+    units = units_of(dataset[name])
+    there: dict[str, Any] = {**asked, **given, name: f"{worst!r} {units}".removesuffix(" 1")}
+    result = point(system, "floquet", **there)
+    shown = in_units(dataset, [unit] if unit else [])
+    span = runs_text(shown[name], [(float(shown[name].min()), float(shown[name].max()))])
+    text, undecided = unstable_text(shown, name), dataset["verdict"].values == VERDICTS.index("undecided")
+    rest = f"the rest of {span} is stable" if text else f"stable at {span}"
+    rest = f"undecided at {ranges_text(shown[name], undecided)}" if undecided.any() else rest
+    sentence = f"{text}; {rest}." if text else f"{rest}."
+    ranges = dataset[f"unstable_{name}"].values.tolist()
+    return replace(result, sentence=f"{sentence[:1].upper()}{sentence[1:]}", unstable=(name, ranges))
 
 
 def _forced(result: PointResult, given: Mapping[str, Any], limit: Limit) -> tuple[str, dict[str, Any]]:
@@ -385,6 +427,8 @@ def _labels(job: Job, values: Mapping[str, Any], buffer: ResultBuffer) -> dict[s
     return {d.name: d.labels(sizes[d.name]) for d in job.scene.dimensions if d.name in sizes}
 
 
+# First samples of a range.
+_RANGE = 91
 # Digits of given values in an answer.
 _PROSE = 6
 # Most modes in the sentence about an order, and speeds of one kind in that about whirl.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -24,10 +25,13 @@ from drivetrain_jax.analysis import Analysis
 from drivetrain_jax.analysis._base import checked
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
 from drivetrain_jax.runs.physical import GivenData, described
-from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.runs.scene import Scene, find_system
 from drivetrain_jax.systems import System
+from drivetrain_jax.view.style import parameters, scene_key, units_of
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from drivetrain_jax.atlas.windows import Crossing
     from drivetrain_jax.runs.atlas_answers import AtlasQuery
 
@@ -383,7 +387,9 @@ def radius_gradient(system: type[System], values: Mapping[str, float]) -> dict[s
 # Samples of a range of speeds: evenly spaced, and halving distances from both ends, where a resonance may lie.
 _EVEN, _HALVINGS = 91, range(8, 22)
 # Points and rounds by which peaks and crossings of the limit are refined.
-_PARTS, _PEAK_ROUNDS, _LIMIT_ROUNDS = 9, 2, 3
+_PARTS, _PEAK_ROUNDS, _LIMIT_ROUNDS, _VERDICT_ROUNDS = 9, 2, 3, 5
+# Part of the middle of an unstable range up to which a predicted resonance belongs to it.
+_NEAR = 0.01
 
 
 @dataclass(frozen=True)
@@ -444,22 +450,74 @@ class Limit:
 
         ``likely`` are speeds near peaks, which may be narrower than the distance of the samples.
         """
-        steps = (high - low) * 0.5 ** np.array(_HALVINGS)
-        likely = likely[(likely > low) & (likely < high)]
-        x = np.unique(np.concatenate([np.linspace(low, high, _EVEN), low + steps, high - steps, likely]))
-        y = amplitude(x)
-        for _ in range(_PEAK_ROUNDS):
-            size = np.max(y, axis=1)
-            peaks = np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] >= size[2:])) + 1
-            x, y = _refined(amplitude, x, y, [(x[k - 1], x[k + 1]) for k in peaks])
-        for _ in range(_LIMIT_ROUNDS):
-            inside = np.max(y, axis=1) <= self.value
-            x, y = _refined(amplitude, x, y, [(x[k], x[k + 1]) for k in np.flatnonzero(inside[1:] != inside[:-1])])
+        x, y = _sampled(amplitude, low, high, likely, self.value, _LIMIT_ROUNDS)
         size = np.max(y, axis=1)
         k = int(np.argmax(size))
-        edges = np.flatnonzero(np.diff(np.concatenate(([0], (size <= self.value).astype(np.int8), [0]))))
-        ranges = tuple((float(x[a]), float(x[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True))
-        return Along(self, float(size[k]), float(x[k]), self.names[int(np.argmax(y[k]))], ranges)
+        return Along(self, float(size[k]), float(x[k]), self.names[int(np.argmax(y[k]))], _runs(x, size <= self.value))
+
+
+def _sampled(
+    function: Callable[[np.ndarray], np.ndarray], low: float, high: float, likely: np.ndarray, limit: float, rounds: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values (n, k) of ``function`` at samples (n,) from ``low`` to ``high``: dense at peaks, and in ``rounds`` ever closer
+    to places where the largest of k crosses ``limit``."""
+    steps = (high - low) * 0.5 ** np.array(_HALVINGS)
+    likely = likely[(likely > low) & (likely < high)]
+    x = np.unique(np.concatenate([np.linspace(low, high, _EVEN), low + steps, high - steps, likely]))
+    y = function(x)
+    for _ in range(_PEAK_ROUNDS):
+        size = np.max(y, axis=1)
+        peaks = np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] >= size[2:])) + 1
+        x, y = _refined(function, x, y, [(x[k - 1], x[k + 1]) for k in peaks])
+    for _ in range(rounds):
+        inside = np.max(y, axis=1) <= limit
+        x, y = _refined(function, x, y, [(x[k], x[k + 1]) for k in np.flatnonzero(inside[1:] != inside[:-1])])
+    return x, y
+
+
+def _runs(x: np.ndarray, holds: np.ndarray) -> tuple[tuple[float, float], ...]:
+    """First and last sample of each run of samples ``x`` that ``holds``."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], holds.astype(np.int8), [0]))))
+    return tuple((float(x[a]), float(x[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True))
+
+
+def with_unstable_ranges(dataset: xr.Dataset) -> tuple[xr.Dataset, float]:
+    """``dataset``, a ``floquet`` result over one axis, with its unstable ranges (``unstable_NAME``) and the resonances next
+    to them (``unstable_resonance``); and the value of the axis with the largest spectral radius.
+
+    Both ends of a range are unstable by their error bound; closer ones beyond are not. A range between two samples is found
+    if the radius rises there, or if a resonance is predicted there.
+    """
+    from drivetrain_jax.runs.run import run
+
+    (name,) = dataset["outcome"].dims
+    axis, scene = dataset[name], tomllib.loads(str(dataset.attrs["scene"]))
+    outputs = ["spectral_radius", "verdict"]
+
+    def size(x: np.ndarray) -> np.ndarray:
+        values = [f"{value!r} {units_of(axis)}".removesuffix(" 1") for value in x.tolist()]
+        solved = run({**scene, "axes": {scene_key(axis): {"values": values}}, "outputs": outputs})
+        radius, unstable = np.nan_to_num(solved["spectral_radius"].values), solved["verdict"].values == 1
+        # Above 1 is what the verdict calls unstable.
+        return np.where(unstable, np.maximum(radius, 1 + 1e-15), np.minimum(radius, 1.0))[:, None]
+
+    known, fixed = find_system(str(dataset.attrs["system"])).resonances, parameters(dataset)
+    foretold = known is not None and known.axis == name and set(known.parameters) <= fixed.keys()
+    predicted, labels = (known.values(fixed), known.labels) if known and foretold else (np.empty(0), ())
+    likely = np.concatenate([axis.values, predicted[np.isfinite(predicted)]])
+    x, y = _sampled(size, float(axis.min()), float(axis.max()), likely, 1.0, _VERDICT_ROUNDS)
+    ends = np.reshape(_runs(x, y[:, 0] > 1), (-1, 2))
+    names = []
+    for low, high in ends:
+        apart = np.nan_to_num(np.abs(predicted - (low + high) / 2), nan=np.inf)
+        near = bool(apart.size) and apart.min() <= max(high - low, _NEAR * high)
+        names.append(labels[apart.argmin()] if near else "")
+    about = {**axis.attrs, "long_name": f"lower and upper end of an unstable range, {name}"}
+    found = {
+        f"unstable_{name}": (("unstable_range", "end"), ends, about),
+        "unstable_resonance": ("unstable_range", names),
+    }
+    return dataset.assign_coords(found), float(x[y[:, 0].argmax()])
 
 
 def _refined(

@@ -38,12 +38,12 @@ from drivetrain_jax.view.style import (
     in_brackets,
     power_of_ten,
     ranges_text,
-    runs_text,
     scene_key,
     size,
     suitable,
     symbol,
     units_of,
+    unstable_text,
     value_in,
     variable_label,
     with_prefixes,
@@ -578,17 +578,18 @@ def stack(dataset: xr.Dataset, along: str, panels: Sequence[Sequence[str]], **lo
             sheet.add(*(() if (codes == k).any() else (span,)))
         if name and codes.ndim == 1:
             above = 24 if overlays.predictions(dataset, along) else 4
-            sheet.axes[0, 0].set_title(_sentence(codes, dataset[along], exact), loc="left", pad=above)
+            unstable = unstable_text(dataset, along)
+            sheet.axes[0, 0].set_title(_sentence(codes, dataset[along], unstable), loc="left", pad=above)
     return sheet
 
 
-def _sentence(codes: xr.DataArray, axis: xr.DataArray, exact: np.ndarray) -> str:
-    """The values of ``axis`` at which flags of :func:`valid` other than the most frequent one occur; ``exact`` are the
-    unstable ranges of an atlas."""
+def _sentence(codes: xr.DataArray, axis: xr.DataArray, exact: str) -> str:
+    """The values of ``axis`` at which flags of :func:`valid` other than the most frequent one occur; ``exact`` says the
+    unstable ranges, if they are known."""
     names = [flag.replace("_", " ") for flag in (*flags(codes), FAILED, PENDING)]
     counts = np.bincount(codes.values.astype(int), minlength=len(names))
     most = int(counts.argmax())
-    words = [f"unstable at {runs_text(axis, exact)}"] if len(exact) else []
+    words = [exact] if exact else []
     shown = [k for k, n in enumerate(names) if counts[k] and k != most and not (words and n in ("stable", "unstable"))]
     words += [f"{names[k]} at {ranges_text(axis, codes.values == k)}" for k in shown]
     text = "; ".join(words) or (f"{names[most]} throughout" if counts[most] == codes.size else "")

@@ -11,6 +11,7 @@ import re
 import tomllib
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import lru_cache
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -193,12 +194,21 @@ def ranges_text(axis: xr.DataArray, holds: np.ndarray) -> str:
     return runs_text(axis, [(axis.values[a], axis.values[b - 1]) for a, b in zip(edges[::2], edges[1::2], strict=True)])
 
 
-def runs_text(axis: xr.DataArray, runs: Sequence[Any] | np.ndarray) -> str:
-    """Ranges of ``axis`` as text, the first ones of many."""
+def runs_text(axis: xr.DataArray, runs: Sequence[Any] | np.ndarray, names: Sequence[str] | np.ndarray = ()) -> str:
+    """Ranges of ``axis`` as text, the first ones of many, each with its name in brackets if ``names`` has one."""
     shown = [f"{a:.6g}" if a == b else f"{a:.6g} to {b:.6g}" for a, b in runs[:MOST_RANGES]]
+    shown = [f"{text} ({name})" if name else text for text, name in zip_longest(shown, names[: len(shown)])]
     more = f" and {len(runs) - MOST_RANGES} more ranges" if len(runs) > MOST_RANGES else ""
     units = units_of(axis)
     return f"{scene_key(axis)} = {', '.join(shown)}{more}{'' if units in ('1', '') else f' {units}'}"
+
+
+def unstable_text(dataset: xr.Dataset, along: str) -> str:
+    """The unstable ranges of the axis ``along`` with the names of their resonances; empty without any."""
+    stored, names = dataset.coords.get(f"unstable_{along}"), dataset.coords.get("unstable_resonance", np.empty(0))
+    if stored is None or not stored.size:
+        return ""
+    return f"unstable at {runs_text(dataset[along], stored.values, np.asarray(names))}"
 
 
 def caption(dataset: xr.Dataset) -> str:
@@ -307,7 +317,7 @@ def in_units(dataset: xr.Dataset, asked: Sequence[str] = ()) -> xr.Dataset:
     dataset, changed = dataset.assign_attrs({ASKED: json.dumps(list(asked))}), {}
     for name, variable in dataset.variables.items():
         units = str(variable.attrs.get("units", "1"))
-        axis = dataset.coords.get(re.sub(r"^(?:boundary|tip|undecided|resonance)_|_error$", "", str(name)))
+        axis = dataset.coords.get(re.sub(r"^(?:boundary|tip|undecided|resonance|unstable)_|_error$", "", str(name)))
         about = {} if axis is None else {"parameter": axis.name, "units": "1", **axis.attrs}
         factor, unit = unit_of(dataset, str(about["parameter"]) if about.get("units") == units else "", units)
         if unit != units and variable.dtype.kind in "fc":

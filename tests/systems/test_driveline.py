@@ -12,13 +12,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
 
 import drivetrain_jax as dt
 from drivetrain_jax.resonances import driveline_resonances, orders_of
 from drivetrain_jax.runs.physical import read_table
+from drivetrain_jax.runs.reply import with_unstable_ranges
 from drivetrain_jax.systems.driveline import MOST_TURNS, best_phases, uneven_rotation
+from drivetrain_jax.view.style import unstable_text
 from tests.oracles import driveline_reference as oracle
 from tests.quick_jit import quick_jit
 from tests.sizes import full_after
@@ -416,6 +419,51 @@ def test_phases_across_a_gear_make_up_for_nothing():
     assert found.speed_variation == pytest.approx(found.least_variation, rel=1e-12)
     # The first joint's speed, doubled, passes a joint of the double speed.
     assert alone.speed_variation < found.speed_variation < 2 * alone.speed_variation * 1.01
+
+
+def test_unstable_ranges_are_those_between_changes_of_the_verdict(monkeypatch):
+    """A wide range, and one that is narrower than the distance of samples, at a predicted resonance."""
+    shaft = {"k": (4e4, 1e4), "J": (0.1, 0.4)}
+    found = driveline_resonances(2)
+    narrow = found.values(shaft)[found.labels.index("C+121")]
+
+    def run(scene):
+        x = np.array([float(text.split()[0]) for text in scene["axes"]["speed"]["values"]])
+        radius = np.where(abs(x - narrow) < 1e-3, 1.1, 1 - 1e-3 * ((x - 400.25) ** 2 - 25.0))
+        codes = (radius > 1).astype(int)
+        return xr.Dataset({"spectral_radius": ("speed", radius), "verdict": ("speed", codes)})
+
+    monkeypatch.setattr("drivetrain_jax.runs.run.run", run)
+    axis = xr.DataArray(np.linspace(200.0, 500.0, 31), dims="speed", attrs={"units": "rad/s"})
+    fixed = {name: {"value": value, "units": "1"} for name, value in shaft.items()}
+    attrs = {"system": "driveline", "scene": 'system = "driveline"', "fixed_parameters": json.dumps(fixed)}
+    result = xr.Dataset({"outcome": ("speed", np.zeros(31, int))}, {"speed": axis}, attrs)
+    answer, worst = with_unstable_ranges(result)
+    expected = sorted([(narrow - 1e-3, narrow + 1e-3), (395.25, 405.25)])
+    np.testing.assert_allclose(answer["unstable_speed"], expected, rtol=0, atol=3e-4)
+    assert sorted(answer["unstable_resonance"].values) == ["", "C+121"]
+    assert worst == pytest.approx(narrow, abs=1e-3)
+    assert unstable_text(answer, "speed").count("(C+121)") == 1
+
+
+@pytest.mark.full
+def test_ends_of_unstable_ranges_are_those_of_lagrange_multipliers():
+    chain: dict[str, Any] = {
+        "k": [9e3, 8e3, 4e4],
+        "c": [0.05, 0.05, 2.0],
+        "J": [0.03, 0.05, 8.0],
+        "beta": [0.2, 0.4, 0.0],
+    }
+    chain |= {"phase": [0.0, 0.3, 0.0], "ratio": [1.0, 1.0, 0.25]}
+    found = dt.point("driveline", "floquet", speed=("1500 rpm", "9000 rpm"), **chain)
+    assert found.unstable is not None
+    name, ranges = found.unstable
+    assert name == "speed" and len(ranges) > 0 and found.verdict == 1
+    low, high = ranges[0]
+    assert f"Unstable at speed = {30 * low / math.pi:.6g} to {30 * high / math.pi:.6g}" in found.sentence
+    for speed, unstable in ((low - 0.01, 0), (low, 1), (high, 1), (high + 0.01, 0)):
+        largest = abs(oracle.multipliers({**chain, "speed": speed}, math.pi)).max()
+        assert (largest > 1) == unstable
 
 
 TRUCK = """part,outer_diameter [mm],inner_diameter [mm],length [mm],J [kg cm2],c [N m s/rad],beta [deg],phase [deg],ratio
