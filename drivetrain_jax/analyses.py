@@ -140,9 +140,7 @@ def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapp
     along = analysis.path_axis(type(system), request)
     leaf = None if along is None else path_entry(values, along)
     if along is not None and isinstance(leaf, jax.core.Tracer):
-        raise InputError(
-            f"{along}: a traced array; allowed for the path that the analysis follows are concrete numbers"
-        )
+        raise InputError(f"{along}: a traced array; expected concrete numbers for the path that the analysis follows")
     path = None if along is None else np.atleast_1d(np.asarray(leaf, float))
     parameters = jax.tree.map(lambda x: None if isinstance(x, str) or x is leaf else jnp.asarray(x, float), values)
     if batch := next((x.shape for x in jax.tree.leaves(parameters) if x.ndim), None):

@@ -517,9 +517,11 @@ def design(options: argparse.Namespace) -> int:
 
     extra = {} if options.margin is None else {"margin": options.margin}
     if extra and options.question != "speed-windows":
-        raise InputError(f"--margin = {options.margin}: not used by {options.question}; allowed for speed-windows")
+        raise InputError(
+            f"--margin = {options.margin}: not used by {options.question}; expected with speed-windows only"
+        )
     if options.vary and options.question == "speed-windows":
-        raise InputError(f"--vary = {options.vary!r}: not used by speed-windows; allowed for the other questions")
+        raise InputError(f"--vary = {options.vary!r}: not used by speed-windows; expected with the other questions")
     extra |= {"vary": options.vary} if options.vary else {}
     values = ranges(options.given, "design")
     question = getattr(atlas_answers, options.question.replace("-", "_"))

@@ -64,8 +64,8 @@ class Criteria:
             raise InputError(f"file: the atlas has no panel ({reason}); expected one whose solves converged")
         if not has_boundaries(self.atlas, self.system):
             raise InputError(
-                f"system = {self.system.name!r}: has no boundary functions; allowed for boundaries "
-                "and design answers is one of four states with a half-period propagator and log_determinant"
+                f"system = {self.system.name!r}: has no boundary functions; expected for boundaries and "
+                "design answers a system of four states with a half-period propagator and log_determinant"
             )
 
     @classmethod

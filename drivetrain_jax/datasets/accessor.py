@@ -179,7 +179,7 @@ class DrivetrainAccessor:
             return open_atlas(self._dataset)
         file = self._file()
         if file is None or self._dataset.attrs.get("method") != "atlas":
-            raise InputError(f"{method}: the result holds values on a grid; allowed for an atlas, opened from its file")
+            raise InputError(f"{method}: the result holds values on a grid; expected an atlas, opened from its file")
         return open_atlas(file)
 
     def _file(self) -> Path | None:

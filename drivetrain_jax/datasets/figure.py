@@ -68,7 +68,7 @@ def plot(
         return drawn([_chart(sources[0], part, cells)], asked)
     if part is not None or cells is not None:
         field = f"part = {shown(part)}" if part is not None else f"cells = {cells}"
-        raise InputError(f"{field}: a result on a grid is drawn whole; allowed for an atlas")
+        raise InputError(f"{field}: a result on a grid is drawn whole; expected an atlas")
     if kinds == ["floquet", "atlas"]:
         from drivetrain_jax.runs.atlas_chart import with_boundaries
 
@@ -207,9 +207,7 @@ def _loaded(dataset: xr.Dataset) -> xr.Dataset:
         raise InputError("result: has words for codes; expected the result itself, before .drivetrain.named()")
     if outcome.size > _MOST_CELLS:
         some = "select some with .sel or .isel"
-        raise InputError(
-            f"result: has {outcome.size:.3g} cells; allowed in a figure are up to {_MOST_CELLS:.0e}: {some}"
-        )
+        raise InputError(f"result: has {outcome.size:.3g} cells; expected up to {_MOST_CELLS:.0e} in a figure: {some}")
     return dataset.compute().assign_coords({d: range(n) for d, n in outcome.sizes.items() if d not in dataset.coords})
 
 

@@ -81,7 +81,7 @@ def _check_used(sections: Iterable[dict[str, Any]], asked: Iterable[str], amplit
             raise InputError(f"units = {unit!r}: nothing in the report measures that; {allowed_units(units)}")
     if amplitude is not None and not any(section["compared"] for section in sections):
         raise InputError(
-            f"amplitude = {amplitude!r}: no result has a forced motion to compare; allowed with an atlas over the speed, a "
+            f"amplitude = {amplitude!r}: no result has a forced motion to compare; expected an atlas over the speed, a "
             "result of floquet of a system with a forced response, or a result of forced that contains amplitude"
         )
 

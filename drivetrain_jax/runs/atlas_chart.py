@@ -104,9 +104,7 @@ def with_boundaries(dataset: xr.Dataset, source: str | Path | xr.Dataset) -> xr.
         plane |= {name: (low, high)} if low < high else {}
         fixed |= {} if low < high else {name: low}
     if len(plane) != 2 or dataset["outcome"].squeeze().ndim != 2:
-        raise InputError(
-            f"axes: the chart varies {', '.join(plane)}; allowed beside an atlas are two of its parameters"
-        )
+        raise InputError(f"axes: the chart varies {', '.join(plane)}; expected two parameters of the atlas beside it")
     dataset = dataset.assign_coords(_stored_curves(atlas, fixed, plane, {}))
     for name in plane:
         axis = dataset[swept[name].dims[0]]

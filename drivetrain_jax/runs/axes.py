@@ -154,7 +154,7 @@ def check_count(field: str, table: AxisTable, continuous: bool) -> int:
         raise InputError(f"{field}.scale = {table.scale!r}: expected one of {', '.join(_SCALES)}")
     if table.scale == "log" and not (start > 0 and stop > 0):
         key, value = ("stop", stop) if start > 0 else ("start", start)
-        raise InputError(f"{field}.{key} = {value}: allowed on a log axis is {key} > 0")
+        raise InputError(f"{field}.{key} = {value}: expected {key} > 0 on a log axis")
     return num
 
 

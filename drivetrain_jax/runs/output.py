@@ -77,7 +77,7 @@ class Output:
         if self.out.is_dir() and not (is_store and self.store == ZARR):
             raise self.error("is a folder; expected the path of a file")
         if self.out.exists() and not self.out.is_dir() and not (self.out.is_file() and self.store == HDF5):
-            what = "is a file; allowed for store = 'zarr' is a new path, or such a store"
+            what = "is a file; expected a new path, or a Zarr store, for store = 'zarr'"
             raise self.error(what if self.store == ZARR else "not a regular file; expected the path of a file")
         self.present = self._digest()
 
@@ -197,7 +197,7 @@ class Output:
         if reuse and self.store == ZARR:
             raise InputError("reuse: given together with store = 'zarr'; expected one of them")
         if reuse and not self.job.route.is_pointwise:
-            raise InputError("reuse: not available for an atlas; allowed for a scene with direct solves")
+            raise InputError("reuse: not available for an atlas; expected a scene with direct solves")
         if not self.job.route.is_pointwise:
             return NO_REUSE
         paths = [Path(path) for path in reuse]

@@ -344,7 +344,7 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
     system, analysis = system_and_analysis(system_name, analysis_name)
     if analysis.continuous:
         others = ", ".join(name for name in analyses_of(system) if not get_analysis(name).continuous)
-        raise InputError(f"analysis = {analysis_name!r}: needs ranges; allowed at a point is one of {others}")
+        raise InputError(f"analysis = {analysis_name!r}: needs ranges; expected at a point one of {others}")
     parameters = described(system)
     options = {o.name: given.get(o.name, o.default) for o in analysis.options}
     path = analysis.path_axis(system, Request((), given.get("method", next(iter(analysis.methods))), options))

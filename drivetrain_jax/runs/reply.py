@@ -406,7 +406,7 @@ class Limit:
         """The checked limit; :class:`InputError` for a system without a forced response."""
         if "forced" not in system.models or system.displacements is None:
             raise InputError(
-                f"amplitude = {shown(written)}: {system.name} has no forced response; allowed for a system that has one"
+                f"amplitude = {shown(written)}: {system.name} has no forced response; expected a system that has one"
             )
         units = system.state[0].units
         largest = math.pi / 2 if units == "rad" else math.inf

@@ -180,7 +180,7 @@ def _job(scene: str | Path | Mapping[str, Any] | Scene, overrides: Mapping[str, 
     job = resolve(scene if isinstance(scene, Scene) else load_scene(scene, overrides))
     needed = 0 if on_disk or job.scene.analysis.continuous else job.total * job.scene.result_bytes
     if needed > (present := physical_memory()):
-        limit = f"allowed here is up to {present / 1e9:.0f} GB"
+        limit = f"expected up to {present / 1e9:.0f} GB here"
         raise InputError(f"axes: {job.total} points need {needed / 1e9:.0f} GB of memory; {limit}")
     return job
 

@@ -201,7 +201,7 @@ def system_and_analysis(system_name: str, analysis_name: str) -> tuple[type[Syst
     except KeyError:
         known = analyses_of(system)
         guess = did_you_mean(str(analysis_name), known)
-        allowed = f"allowed for {system.name} is one of {', '.join(known)}"
+        allowed = f"expected for {system.name} one of {', '.join(known)}"
         raise InputError(f"analysis = {analysis_name!r}: unknown{guess}; {allowed}") from None
     except ImportError as error:
         raise InputError(f"analysis = {analysis_name!r}: {' '.join(str(error).split())}") from error
@@ -306,7 +306,7 @@ def axes_of(
     specs = {}
     for name, parameter in swept.items():
         if analysis.continuous and parameter.integer:
-            allowed = f"allowed for {analysis.name} are parameters with a continuous range"
+            allowed = f"expected for {analysis.name} a parameter with a continuous range"
             raise InputError(f"axes.{name}: an integer; {allowed}")
         if points and not isinstance(points[name], list):
             raise InputError(f"points.{name} = {shown(points[name])}: expected a list of numbers")
@@ -322,7 +322,7 @@ def axes_of(
     most, present = max(counts.values(), default=0), physical_memory()
     if most * _BYTES > present:
         name = max(counts, key=lambda name: counts[name])
-        raise InputError(f"axes.{name}.num = {most}: allowed with this memory is up to {int(present / _BYTES)}")
+        raise InputError(f"axes.{name}.num = {most}: expected up to {int(present / _BYTES)} with this memory")
     found = []
     for name, (table, scalar) in specs.items():
         values = spread(table, f"axes.{name}")

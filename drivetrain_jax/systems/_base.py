@@ -347,7 +347,7 @@ class System(eqx.Module):
         known = [field.name for field in dataclass_fields(cls)]
         for name in given:
             if name in physical:
-                raise InputError(f"{name}: physical data; allowed in {cls.__name__}.from_physical(...)")
+                raise InputError(f"{name}: physical data; expected in {cls.__name__}.from_physical(...)")
             if name not in known:
                 raise InputError(f"{name}: unknown{meant(name, cls.parameters)}; expected {', '.join(known)}")
         return super().__new__(cls)

@@ -415,7 +415,7 @@ class PiecewiseLinearOscillator(eqx.Module):
     def check_method(damps_play: bool, method: str) -> None:
         """Raise :class:`InputError` for an approximate method, unless the damper always acts."""
         if not damps_play and method != "exact":
-            raise InputError(f"options.method = {method!r}: allowed for a damper in contact only is 'exact'")
+            raise InputError(f"options.method = {method!r}: expected 'exact' for a damper in contact only")
 
     @property
     def follows(self) -> bool:

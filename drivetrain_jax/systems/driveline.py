@@ -202,8 +202,8 @@ def check(fixed: Values) -> None:
         speed *= r
     if speeds and _half_turns(speeds) is None:
         raise ValueError(
-            f"ratio = {list(ratio)}: the joints have no common period of up to {MOST_TURNS} turns; allowed between joints "
-            'are ratios of few teeth, such as "41/11"'
+            f"ratio = {list(ratio)}: the joints have no common period of up to {MOST_TURNS} turns; expected ratios of few "
+            'teeth between joints, such as "41/11"'
         )
 
 

@@ -78,8 +78,8 @@ def _check_equation(fixed: Values, allowed: tuple[str, ...]) -> None:
     equation = fixed.get("equation")
     if equation is not None and equation not in allowed:
         raise ValueError(
-            f"equation = {equation!r}: allowed for this analysis of the {fixed['element']} element is "
-            f"{' or '.join(allowed)}"
+            f"equation = {equation!r}: expected {' or '.join(allowed)} for this analysis of the "
+            f"{fixed['element']} element"
         )
 
 

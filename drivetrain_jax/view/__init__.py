@@ -39,7 +39,9 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     record = BUILT_IN.get(analysis, Declared())
     if others and plugin is None and not record.overlaid:
         allowed = ", ".join(name for name, other in BUILT_IN.items() if other.overlaid)
-        raise InputError(f"analysis = {analysis!r}: several results in one figure; allowed for {allowed}")
+        raise InputError(
+            f"analysis = {analysis!r}: several results in one figure; expected one, or several of {allowed}"
+        )
     for other in others:
         if other.attrs.get("analysis") != analysis:
             raise InputError(

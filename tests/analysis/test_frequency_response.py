@@ -140,7 +140,7 @@ def test_a_range_that_is_given_is_kept():
     ],
 )
 def test_results_that_a_method_lacks_are_refused(method, output, allowed):
-    with pytest.raises(InputError, match=f"method {method} does not give {output}; allowed for it is {allowed}"):
+    with pytest.raises(InputError, match=f"method {method} does not give {output}; expected {allowed}"):
         run(method, outputs=(output,))
 
 

@@ -186,7 +186,7 @@ def test_axis_larger_than_memory_is_refused_before_it_is_made(folder, capsys, mo
     Path("scene.toml").write_text(toml.write(GOOD | {"axes": {"a": {"start": 0.0, "stop": 10.0, "num": 10**9}}}))
     code, err = judge(folder, capsys, "run", "scene.toml", "--out", "r.nc")
     assert code == 2
-    assert "axes.a.num = 1000000000: allowed with this memory is up to 31250000" in err[0]
+    assert "axes.a.num = 1000000000: expected up to 31250000 with this memory" in err[0]
 
 
 def test_an_output_that_points_elsewhere_is_only_that(folder, capsys):

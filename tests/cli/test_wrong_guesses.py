@@ -81,7 +81,7 @@ GUESSES = [
     (f"{RUN} --set axes.beta.start=0:1", "':1' is not a unit"),
     (f"{RUN} --set axes.Omega.scale=logarithmic", "expected one of lin, log"),
     (f"{RUN} --set outputs=[radius]", "is not a result of floquet"),
-    (f"{RUN} --set analysis=stability", "allowed for cardan is one of floquet"),
+    (f"{RUN} --set analysis=stability", "expected for cardan one of floquet"),
     (f"{RUN} --set system=carden", "did you mean cardan?"),
     (f"{RUN} --set options.tol=1e-6", "not used by method auto"),
     (f"{RUN} --set options.method=exact", "options.method = 'exact'"),
@@ -100,8 +100,8 @@ GUESSES = [
     (f"{POINT} beta=0.2", "beta is given twice"),
     (f"{POINT} angle=12", "given besides angle; expected one of the two"),
     (f"{POINT} J1=2", "J1: nothing follows from it"),
-    (POINT.replace("floquet", "stability"), "allowed for cardan is one of floquet"),
-    (POINT.replace("floquet", "atlas"), "allowed at a point is one of"),
+    (POINT.replace("floquet", "stability"), "expected for cardan one of floquet"),
+    (POINT.replace("floquet", "atlas"), "expected at a point one of"),
     (POINT.replace("cardan", "shaft"), "system = 'shaft': unknown"),
     (f"{POINT} outputs=radius", "is not a result of floquet"),
     (f"{POINT} tolerance=1e-6", "unknown"),
@@ -236,7 +236,7 @@ def test_columns_and_lists_are_axes():
 def test_calls_that_miss_the_point_are_answered_by_name():
     shaft = dt.Cardan(**BASE)
     for call, answer in (
-        (lambda: dt.Cardan(J1=2.0, **BASE), "J1: physical data; allowed in Cardan.from_physical"),
+        (lambda: dt.Cardan(J1=2.0, **BASE), "J1: physical data; expected in Cardan.from_physical"),
         (lambda: dt.Cardan(**BASE, Zeta=0.1), r"Zeta: unknown \(did you mean zeta\?\); expected beta, Omega"),
         (lambda: dt.Cardan(0.3, 1.4), r"Cardan: 2 values without names; expected Cardan\(name=value"),
         (lambda: dt.sweep("floquet", shaft, over={"beta": [0.1]}), "function = 'floquet': expected a function"),

@@ -168,7 +168,7 @@ def test_a_chart_shows_the_tongues_of_its_atlas(folder, chart):
             {},
             "results: an atlas among several; expected an atlas alone, or a chart and its atlas",
         ),
-        (["chart.nc"], {"cells": 5}, "cells = 5: a result on a grid is drawn whole; allowed for an atlas"),
+        (["chart.nc"], {"cells": 5}, "cells = 5: a result on a grid is drawn whole; expected an atlas"),
         ([], {}, "result = []: expected a result, or a list of one or more"),
         (["chart.nc"], {"units": 5}, 'units = 5: expected units such as "rpm,deg", or a list of them'),
         (
@@ -189,7 +189,7 @@ def test_what_plot_does_not_take(folder, results, options, message):
 
 
 def test_a_grid_without_end_is_not_drawn(folder):
-    with pytest.raises(dt.InputError, match=r"has 1e\+10 cells; allowed in a figure are up to 1e\+08: select some"):
+    with pytest.raises(dt.InputError, match=r"has 1e\+10 cells; expected up to 1e\+08 in a figure: select some"):
         xr.open_dataset(folder / "atlas.nc", engine="drivetrain", grid=100_000).drivetrain.plot()
 
 
@@ -282,7 +282,7 @@ def test_query(folder, chart):
     assert answer.data["meanings"]["verdict"] == "stable" and repr(answer) == str(answer)
     lazily = xr.open_dataset(folder / "atlas.nc", engine="drivetrain", grid={"beta": 0.1}).isel(Omega=slice(5))
     assert lazily.drivetrain.query(beta=0.31, Omega=1.2).data == answer.data
-    with pytest.raises(dt.InputError, match="query: the result holds values on a grid; allowed for an atlas"):
+    with pytest.raises(dt.InputError, match="query: the result holds values on a grid; expected an atlas"):
         chart.drivetrain.query(beta=0.31, Omega=1.2)
 
 

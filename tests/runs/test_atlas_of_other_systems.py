@@ -103,7 +103,7 @@ def test_an_integer_is_no_range_of_an_atlas(monkeypatch):
     """Between integers the motion of this pendulum has no such period, so its multipliers mean nothing."""
     axes = {"order": {"start": 1, "stop": 3}}
     fixed = {"omega": 1.1, "depth": 0.3}
-    with pytest.raises(InputError, match=r"axes\.order: an integer; allowed for atlas are"):
+    with pytest.raises(InputError, match=r"axes\.order: an integer; expected for atlas a"):
         load_scene(SCENE | {"axes": axes, "fixed": fixed})
     many = {"order": {"start": 1, "stop": 3, "num": 3}, "omega": {"start": 0.8, "stop": 1.2, "num": 400}}
     chart = {"system": "pendulum", "analysis": "floquet", "axes": many, "fixed": {"depth": 0.3}}

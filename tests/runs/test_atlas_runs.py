@@ -471,7 +471,9 @@ def test_a_system_without_boundary_functions_has_values_and_charts(atlas, stored
         changed = lambda values, of=reduced: replace(build(values), reduced=of(build(values)))  # noqa: E731
         model = replace(system.models["floquet"], build=changed)
         other = type("Variant", (system,), {"models": system.models | {"floquet": model}})
-        with pytest.raises(dt.InputError, match="system = 'cardan': has no boundary functions; allowed for boundaries"):
+        with pytest.raises(
+            dt.InputError, match="system = 'cardan': has no boundary functions; expected for boundaries"
+        ):
             Criteria.of(atlas.stability.atlas, other)
     for module in (atlas_answers, atlas_chart):
         monkeypatch.setattr(module, "has_boundaries", lambda *_: False)

@@ -173,7 +173,7 @@ def test_unknown_system_and_analysis():
 
 def test_a_function_has_no_value_at_one_point():
     names = "floquet, history, lyapunov, forced, frequency_response"
-    message = f"analysis = 'atlas': needs ranges; allowed at a point is one of {names}"
+    message = f"analysis = 'atlas': needs ranges; expected at a point one of {names}"
     with pytest.raises(dt.InputError, match=f"^{message}$"):
         dt.point("cardan", "atlas", beta=0.3)
 

@@ -134,7 +134,7 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
     margins = [name for name in ("separation_margin", "required_margin") if name in request.outputs]
     if high < low or (high == 0 and margins):
         raise InputError(
-            f"options.operating_max = {high:g}: allowed for {margins[0] if margins else 'the operating speeds'} is a "
+            f"options.operating_max = {high:g}: expected for {margins[0] if margins else 'the operating speeds'} a "
             f"speed > 0, at least operating_min = {low:g}"
         )
     dimensions = [Dimension("mode", "number of the mode", tuple(range(1, options["modes"] + 1)))]

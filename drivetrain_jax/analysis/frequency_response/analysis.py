@@ -220,13 +220,13 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
     for name in request.outputs:
         if request.method not in _ONLY.get(name, (request.method,)):
             methods = ", ".join(_ONLY[name])
-            raise InputError(f"outputs: method {request.method} does not give {name}; allowed for it is {methods}")
+            raise InputError(f"outputs: method {request.method} does not give {name}; expected {methods}")
     PiecewiseLinearOscillator.check_method(fixed.get("damping") != "contact", request.method)
     for name in () if fixed.get("unbalance") is None else _OF_ONE_DRIVE.intersection(request.outputs):
         if request.method != "exact":
             raise InputError(
                 f"outputs: {request.method} gives {name} for a drive of one amplitude; "
-                f"allowed with an unbalance are the other results, or the method exact for fold_frequency"
+                "expected with an unbalance other results, or the method exact for fold_frequency"
             )
     samples, harmonics = (request.options.get(name, 0) for name in ("samples", "harmonics"))
     if 0 < samples <= 2 * harmonics:

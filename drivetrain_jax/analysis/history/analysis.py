@@ -102,9 +102,7 @@ def _play_dimensions(system: type[System], request: Request, fixed: Mapping[str,
     for variable in _AVERAGED if request.method == "exact" else _EXACT:
         if variable.name in request.outputs:
             other = next(method for method in _PLAY_METHODS if method != request.method)
-            raise InputError(
-                f"outputs: method {request.method} does not give {variable.name}; allowed for it is {other}"
-            )
+            raise InputError(f"outputs: method {request.method} does not give {variable.name}; expected {other}")
     events = tuple(range(1, request.options.get("most_events", 0) + 1))
     return Dimension("time", "time", requested_times(request), "s"), Dimension("event", "number of the event", events)
 
