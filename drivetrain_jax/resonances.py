@@ -6,8 +6,8 @@ This module does not import jax, because figures of stored results need none.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -250,8 +250,18 @@ class Orders:
         return said or ["no order meets a natural frequency"]
 
 
-def orders_of(system: str, values: Mapping[str, Any]) -> Orders | None:
-    """The orders that excite ``system``, from its parameters and physical data ``values``; None if they are not known."""
+def orders_of(system: str, values: Mapping[str, Any], further: Sequence[float] = ()) -> Orders | None:
+    """The orders that excite ``system``, from its parameters and physical data ``values``, and ``further`` ones; None if
+    there are none."""
+    known, names = _own_orders(system, values), {f"order {n:.6g}": float(n) for n in further}
+    if not names:
+        return known
+    known = known or Orders({"driveline": "driven end", "planetary": "carrier"}.get(system, "shaft"), {})
+    return replace(known, per_turn={**known.per_turn, **names})
+
+
+def _own_orders(system: str, values: Mapping[str, Any]) -> Orders | None:
+    """The orders that follow from the parameters."""
     if system == "bicardan":
         # A joint under an angle and a torque bends the shaft twice a turn.
         discs = any(np.any(values.get(name) or 0.0) for name in ("Ip_A", "Ip_D", "Ip_joint"))
@@ -273,10 +283,12 @@ def orders_of(system: str, values: Mapping[str, Any]) -> Orders | None:
 
 def stored_orders(attrs: Mapping[str, Any]) -> Orders | None:
     """The orders of a result with these attributes; None if the result is that of one order."""
-    if json.loads(attrs.get("options", "{}")).get("order"):
+    options = json.loads(attrs.get("options", "{}"))
+    if options.get("order"):
         return None
     known = json.loads(attrs.get("physical_data", "{}")) | json.loads(attrs.get("fixed_parameters", "{}"))
-    return orders_of(str(attrs.get("system")), {n: e["value"] for n, e in known.items() if isinstance(e, dict)})
+    values = {n: e["value"] for n, e in known.items() if isinstance(e, dict)}
+    return orders_of(str(attrs.get("system")), values, options.get("orders", ()))
 
 
 def operating_range(options: Mapping[str, Any]) -> tuple[float, float] | None:

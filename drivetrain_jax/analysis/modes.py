@@ -521,8 +521,11 @@ def _of_system(system: type[System]) -> dict[str, Any]:
 
 OPTIONS = (
     Parameter("track", "1", "axis along which modes are tracked", default="", text=True),
-    Parameter("operating_min", "rpm", "lowest operating speed of the carrier", default=0.0, lower=0.0),
-    Parameter("operating_max", "rpm", "highest operating speed of the carrier (0: not given)", default=0.0, lower=0.0),
+    Parameter("operating_min", "rpm", "lowest operating speed", default=0.0, lower=0.0),
+    Parameter("operating_max", "rpm", "highest operating speed (0: not given)", default=0.0, lower=0.0),
+    Parameter(
+        "orders", "1", "further orders, such as an engine's", default=(), listed=True, lower=0.0, open_lower=True
+    ),
 )
 ANALYSIS = Analysis(
     name="modes",

@@ -489,7 +489,7 @@ class OrderCrossings:
 def order_crossings(scene: Scene, parameters: Mapping[str, Any], values: Mapping[str, Any]) -> OrderCrossings | None:
     """The crossings of the frequencies among the results ``values`` of one point; None without frequencies or orders."""
     name = next((name for name in (*FREQUENCIES, "whirl_frequency") if name in values), None)
-    orders = orders_of(scene.system.name, {**parameters, **scene.data})
+    orders = orders_of(scene.system.name, {**parameters, **scene.data}, scene.request.options.get("orders", ()))
     if name is None or orders is None or scene.request.options.get("order"):
         return None
     operating = operating_range(scene.request.options)

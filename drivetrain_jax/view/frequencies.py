@@ -57,7 +57,8 @@ _NUMBER: dict[str, Any] = {"va": "top", "path_effects": [withStroke(linewidth=2,
 # Results that are drawn, the first one that is stored.
 _SPEEDS = ("critical_speed", *FREQUENCIES)
 # Line styles of the orders, and their colours in maps.
-_DASHES, _ORDER_COLOURS = ("solid", "dashed", "dotted", "dashdot"), ("black", LINE_COLOURS[1])
+_DASHES: tuple[Any, ...] = ("solid", "dashed", "dotted", "dashdot", (0, (9, 2)), (0, (6, 2, 1, 2, 1, 2)), (0, (1, 4)))
+_ORDER_COLOURS = "black", LINE_COLOURS[1]
 # Colours of backward, planar and forward whirl.
 _SENSES = ("#16324f", "#9a9a9a", "#d1771e")
 # Height of a Campbell diagram relative to the highest frequency.
@@ -532,7 +533,7 @@ def _interference(dataset: xr.Dataset, orders: Orders, colours: Any, kinds: Mapp
     ends = np.stack([np.full(shown.size, high), frequency[shown]], axis=-1)
     sheet.later(partial(write_names, axes, ends, names))
     sheet.add(*(Line2D([], [], color=colour, label=kind) for kind, colour in kinds.items()))
-    for k, ((label, times), dashes) in enumerate(zip(orders.per_turn.items(), _DASHES, strict=False)):
+    for k, ((label, times), dashes) in enumerate(zip(orders.per_turn.items(), cycle(_DASHES))):
         style = {"color": "black", "linewidth": 0.9, "linestyle": dashes, "label": f"{label} ({times:g}/turn)"}
         sheet.add(*axes.plot([0, high], [0, times * high / 60], **style))
         met = np.stack([speeds[shown, k], frequency[shown]], axis=-1)

@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import eigh
 
 import drivetrain_jax as dt
-from drivetrain_jax.resonances import driveline_resonances, orders_of
+from drivetrain_jax.resonances import Orders, driveline_resonances, orders_of, stored_orders
 from drivetrain_jax.runs.physical import read_table
 from drivetrain_jax.runs.reply import with_unstable_ranges
 from drivetrain_jax.systems.driveline import MOST_TURNS, best_phases, uneven_rotation
@@ -490,6 +490,8 @@ def test_a_table_of_parts_is_a_driveline(tmp_path):
     first = found.natural_frequency[1]
     assert set(found.crossings) == {"order 2 (joints)", "order 4 (joints)"}
     assert found.crossings["order 2 (joints)"][1] == pytest.approx(30 * first, rel=1e-12)
+    engine = dt.point("driveline", "modes", material="steel", orders=[3], **data)
+    assert engine.crossings["order 3"][1] == pytest.approx(20 * first, rel=1e-12)
 
 
 def test_a_table_of_parts_may_be_toml(tmp_path):
@@ -535,4 +537,10 @@ def test_orders_follow_from_the_speed_of_each_joint():
         "order 6 (joints)": 6.0,
         "order 12 (joints)": 12.0,
     }
-    assert orders_of("driveline", {"k": (1.0,), "beta": (0.0,)}) is None
+    straight: dict[str, Any] = {"k": (1.0,), "beta": (0.0,)}
+    assert orders_of("driveline", straight) is None
+    # An engine of four cylinders excites the order 2, and one with a half order, without any joint.
+    engine = orders_of("driveline", straight, (2.0, 0.5))
+    assert engine is not None and engine.per_turn == {"order 2": 2.0, "order 0.5": 0.5}
+    attrs = {"system": "driveline", "options": json.dumps({"orders": [6]}), "fixed_parameters": "{}"}
+    assert stored_orders(attrs) == Orders("driven end", {"order 6": 6.0})
