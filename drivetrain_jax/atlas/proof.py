@@ -71,7 +71,7 @@ def proved_error(atlas: Atlas, panel: Panel, system: type[System]) -> tuple[floa
         return math.inf, f"{system.name} has no enclosure of its propagators"
     if not set(enclosure.varying).issuperset(atlas.parameters):
         over, among = (", ".join(names) for names in (atlas.parameters, enclosure.varying))
-        return math.inf, f"the atlas varies {over}; a proof allows {among}"
+        return math.inf, f"the atlas varies {over}; proofs exist over {among}"
     ranges = dict(zip(atlas.parameters, zip(atlas.lower, atlas.upper, strict=True), strict=True))
     domain = floquet_domain(system, ranges, atlas.fixed)
     margin = _BEYOND * (panel.upper - panel.lower)
