@@ -12,63 +12,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis.numerics.kernels import in_one_kernel, stored, suits_one_kernel
 from drivetrain_jax.systems import Flow
-
-# Coefficients of DOP853, the explicit Runge-Kutta scheme of order 8 with 12 stages by Dormand and Prince.
-#
-# ``y_(n+1) = y_n + h sum_i B_i k_i`` with ``k_i = f(t_n + C_i h, y_n + h sum_(j<i) A_ij k_j)``.
-#
-# Source: Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, 2nd ed. (1993), II.5, and their dop853.f.
-# SciPy has the same numbers, but its import costs a third of a second.
-
-
-STAGES = 12
-# Weights of the slopes of earlier stages, for each stage; then those of all slopes for the step.
-# fmt: off
-_STAGE_WEIGHTS = (
-    (),
-    (0.05260015195876773,),
-    (0.0197250569845379, 0.0591751709536137),
-    (0.02958758547680685, 0.0, 0.08876275643042054),
-    (0.2413651341592667, 0.0, -0.8845494793282861, 0.924834003261792),
-    (0.037037037037037035, 0.0, 0.0, 0.17082860872947386, 0.12546768756682242),
-    (0.037109375, 0.0, 0.0, 0.17025221101954405, 0.06021653898045596, -0.017578125),
-    (
-        0.03709200011850479, 0.0, 0.0, 0.17038392571223998, 0.10726203044637328, -0.015319437748624402,
-        0.008273789163814023,
-    ),
-    (
-        0.6241109587160757, 0.0, 0.0, -3.3608926294469414, -0.868219346841726, 27.59209969944671, 20.154067550477894,
-        -43.48988418106996,
-    ),
-    (
-        0.47766253643826434, 0.0, 0.0, -2.4881146199716677, -0.590290826836843, 21.230051448181193,
-        15.279233632882423, -33.28821096898486, -0.020331201708508627,
-    ),
-    (
-        -0.9371424300859873, 0.0, 0.0, 5.186372428844064, 1.0914373489967295, -8.149787010746927, -18.52006565999696,
-        22.739487099350505, 2.4936055526796523, -3.0467644718982196,
-    ),
-    (
-        2.273310147516538, 0.0, 0.0, -10.53449546673725, -2.0008720582248625, -17.9589318631188, 27.94888452941996,
-        -2.8589982771350235, -8.87285693353063, 12.360567175794303, 0.6433927460157636,
-    ),
-)
-A = np.array([np.pad(weights, (0, STAGES - len(weights))) for weights in _STAGE_WEIGHTS])
-B = np.array([
-    0.054293734116568765, 0.0, 0.0, 0.0, 0.0, 4.450312892752409, 1.8915178993145003, -5.801203960010585,
-    0.3111643669578199, -0.1521609496625161, 0.20136540080403034, 0.04471061572777259,
-])
-C = np.array([
-    0.0, 0.05260015195876773, 0.0789002279381516, 0.1183503419072274, 0.2816496580927726,
-    0.3333333333333333, 0.25, 0.3076923076923077, 0.6512820512820513, 0.6, 0.8571428571428571, 1.0,
-])
-# fmt: on
-
 
 Vector = tuple[Array, ...]
 
@@ -141,13 +88,16 @@ def strobe_map(flow: Flow, steps: Any) -> Callable[..., Frame]:
 
 
 def _step(flow: Flow, angles: Callable[[float], tuple], h: Any, frame: Frame) -> Frame:
-    """One step of DOP853 for all parts of the frame."""
+    """One step of DOP853 (Hairer, Norsett & Wanner, Solving ODEs I, 2nd ed. (1993), II.5) for all parts of the frame."""
+    # Local import: it takes half a second, and only tracing needs it.
+    from scipy.integrate import DOP853
+
     slopes: list[Frame] = []
-    for stage, (c, b) in enumerate(zip(C, B, strict=True)):
-        at = _advanced(frame._replace(contraction=None), h, A[stage, :stage], slopes)
+    for stage, (c, b) in enumerate(zip(DOP853.C, DOP853.B, strict=True)):
+        at = _advanced(frame._replace(contraction=None), h, DOP853.A[stage, :stage], slopes)
         contracts = frame.contraction is not None and b != 0
         slopes.append(_slopes(flow, contracts, angles(float(c)), at))
-    return _advanced(frame, h, B, slopes)
+    return _advanced(frame, h, DOP853.B, slopes)
 
 
 def _advanced(frame: Frame, h: Any, weights: Any, slopes: Sequence[Frame]) -> Frame:
@@ -219,7 +169,6 @@ def orthonormal(tangents: Vector) -> tuple[Vector, Array]:
 # start. A step of length h turns by y = rho h at the fastest rate rho. By its stability function on the imaginary axis,
 # DOP853 changes the logarithm of an amplitude by 2.4e-8 y^10 with little damping, and by less than 4e-7 of the decay
 # with strong damping. For exponents only the ratio to the decay matters.
-
 
 # Fewest steps per strobe, also those of a flow without a known frequency; most steps unless the option `steps` is given.
 LEAST, MOST = 48, 100_000
