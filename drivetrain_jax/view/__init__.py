@@ -6,9 +6,8 @@ a function from a Dataset to a Figure.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._plugins import FIGURES, call_plugin, load_plugin, plugin_names
@@ -35,18 +34,19 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     if analysis == "atlas":
         drawn = "what its `grid` and `drivetrain plot` make of it"
         raise InputError(f"analysis = 'atlas': is a function; expected {drawn}")
-    plugin = None if analysis in BUILT_IN else _plugin(analysis)
+    try:
+        plugin = None if analysis in BUILT_IN else load_plugin(FIGURES, analysis, "a function")
+    except ImportError as error:
+        raise InputError(f"analysis = {analysis!r}: {' '.join(str(error).split())}") from error
     record = BUILT_IN.get(analysis, Declared())
     if others and plugin is None and not record.overlaid:
         allowed = ", ".join(name for name, other in BUILT_IN.items() if other.overlaid)
         raise InputError(
             f"analysis = {analysis!r}: several results in one figure; expected one, or several of {allowed}"
         )
-    for other in others:
-        if other.attrs.get("analysis") != analysis:
-            raise InputError(
-                f"analysis = {other.attrs.get('analysis')!r}: expected the analysis of the first result, {analysis}"
-            )
+    for other in (one.attrs.get("analysis") for one in others):
+        if other != analysis:
+            raise InputError(f"analysis = {other!r}: expected the analysis of the first result, {analysis}")
     # Local imports: matplotlib takes long, and results without a figure need none.
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -68,11 +68,3 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
             figure = getattr(import_module(f"drivetrain_jax.view.{module}"), name)(*datasets)
         look = {"logarithmic": record.logarithmic, "dots": record.dots}
         return figure or chart(datasets[0], record.panels, record.fields, **look)
-
-
-def _plugin(analysis: str) -> Callable[..., Any] | None:
-    """The function of another package that draws ``analysis``, or None."""
-    try:
-        return load_plugin(FIGURES, analysis, "a function")
-    except ImportError as error:
-        raise InputError(f"analysis = {analysis!r}: {' '.join(str(error).split())}") from error

@@ -79,13 +79,8 @@ _SUMMED = ("lyapunov_spectrum", "paper_estimator")
 # Position between largest decay (-1), none (0) and largest growth (1), and colour; lightness falls monotonically. White is
 # reserved for cells without a value.
 _GROWTH_COLOURS = (
-    (-1.0, "#fbfce0"),
-    (-0.5, "#a9dcc3"),
-    (0.0, "#86b1d6"),
-    (0.12, "#d98e48"),
-    (0.5, "#b8432f"),
-    (1.0, "#2d0a2b"),
-)
+    (-1.0, "#fbfce0"), (-0.5, "#a9dcc3"), (0.0, "#86b1d6"), (0.12, "#d98e48"), (0.5, "#b8432f"), (1.0, "#2d0a2b"),
+)  # fmt: skip
 # Distance of a spectral radius from 1 that rounding can make.
 _ROUNDING = 1e-12
 
@@ -158,10 +153,8 @@ def horizontal_first(dataset: xr.Dataset, names: Sequence[str]) -> list[str]:
 
 def varying_parameters(dataset: xr.Dataset) -> list[str]:
     """Parameters with several values in a list of points; raises :class:`InputError` without one."""
-    columns = {
-        str(name): c for name, c in dataset.coords.items() if c.dims == ("point",) and name not in _NO_PARAMETERS
-    }
-    varying = [name for name, values in columns.items() if np.unique(values).size > 1]
+    columns = [c for name, c in dataset.coords.items() if c.dims == ("point",) and name not in _NO_PARAMETERS]
+    varying = [str(values.name) for values in columns if np.unique(values).size > 1]
     if not varying:
         raise InputError("points: all points are the same, there is nothing to plot; give points that differ")
     return varying
@@ -338,11 +331,8 @@ def chart(dataset: xr.Dataset, panels: Sequence[Sequence[str]] = (), fields: Seq
 
 def results(dataset: xr.Dataset) -> list[str]:
     """Names of the numbers in a result, without outcomes and errors."""
-    return [
-        str(name)
-        for name, variable in dataset.data_vars.items()
-        if name != "outcome" and variable.dtype.kind in "fiub" and not str(name).endswith("_error")
-    ]
+    numbers = [str(name) for name, variable in dataset.data_vars.items() if variable.dtype.kind in "fiub"]
+    return [name for name in numbers if name != "outcome" and not name.endswith("_error")]
 
 
 def _flagged(dataset: xr.Dataset) -> str:
@@ -386,10 +376,8 @@ def table_rows(dataset: xr.Dataset, digits: str = ".6g") -> list[tuple[str, str,
         label, words = str(variable.attrs.get("long_name", name)), flags(variable)
         for place in np.ndindex(variable.shape):
             entry = variable[place]
-            labels = [
-                f", {dim} {entry[dim].item() if dim in entry.coords else k}"
-                for dim, k in zip(variable.dims, place, strict=True)
-            ]
+            numbered = zip(variable.dims, place, strict=True)
+            labels = [f", {dim} {entry[dim].item() if dim in entry.coords else k}" for dim, k in numbered]
             value = words[int(entry)].replace("_", " ") if words else f"{entry.item():{digits}}"
             rows.append((label + "".join(labels), value, "" if units == "1" else units))
     return rows
@@ -524,11 +512,11 @@ def split(parts: Sequence[xr.Dataset], name: str) -> list[tuple[str, list[xr.Dat
 
 def _title(part: xr.Dataset, names: Sequence[str]) -> str:
     """``symbol = value units`` of parameters, ``driving shaft`` or ``mode 1`` of entries of another dimension."""
-    shown = [part[name] for name in names if name in part.coords and not part[name].ndim]
-    return ", ".join(
-        coordinate_text(c) if c.dtype.kind == "f" else entry_name(str(c.name).replace("_", " "), c.item())
-        for c in shown
-    )
+
+    def text(c: xr.DataArray) -> str:
+        return coordinate_text(c) if c.dtype.kind == "f" else entry_name(str(c.name).replace("_", " "), c.item())
+
+    return ", ".join(text(part[name]) for name in names if name in part.coords and not part[name].ndim)
 
 
 def entry_name(dimension: str, entry: object) -> str:
@@ -558,12 +546,10 @@ def stack(dataset: xr.Dataset, along: str, panels: Sequence[Sequence[str]], **lo
     Flags (verdict, regime, failed and pending points) are bands behind the lines. ``look`` goes to :func:`draw_lines`.
     """
     sheet = Sheet(len(panels), height=max(1.7, 3.0 / len(panels) ** 0.5), sharey=False)
-    labels = [
-        draw_lines(sheet, axes, dataset, along, keys, **look) for (axes,), keys in zip(sheet.axes, panels, strict=True)
-    ]
+    drawn = list(zip(sheet.axes[:, 0], panels, strict=True))
+    labels = [draw_lines(sheet, axes, dataset, along, keys, **look) for axes, keys in drawn]
     sheet.label(axis_label(dataset[along]), *labels)
-    for (axes,), keys in zip(sheet.axes, panels, strict=True):
-        sheet.add(*(draw_flanks(dataset, axes) if "u_max" in keys else ()))
+    sheet.add(*(entry for axes, keys in drawn if "u_max" in keys for entry in draw_flanks(dataset, axes)))
     fit_panels(sheet, dataset, along)
     if along in dataset["outcome"].dims:
         codes = valid(dataset, name) if (name := _flagged(dataset)) else computed(dataset)
@@ -644,10 +630,8 @@ def draw_lines(
             line = values.isel({inner: k}) if inner else values
             names = [entry_name(inner, line[inner].item() if inner in line.coords else k)] if inner else []
             names += [" ".join(word for word in titles[number] if word not in common)] if len(keys) > 1 else []
-            look: dict[str, Any] = {
-                "color": colours[(k if inner else number) % len(colours)],
-                "label": ", ".join(names),
-            }
+            colour = colours[(k if inner else number) % len(colours)]
+            look: dict[str, Any] = {"color": colour, "label": ", ".join(names)}
             look |= {"linestyle": _DASHES[number if inner else 0]} | style
             look |= {"linewidth": 0.9 + 0.6 * (values.sizes[inner] - 1 - k)} if wider and inner else {}
             drawn = axes.plot(x, line, **look)
@@ -680,11 +664,8 @@ def _scaled(dataset: xr.Dataset, name: str, values: xr.DataArray) -> tuple[xr.Da
     growth, label = growth_of(dataset), variable_label(dataset[name])
     if not _is_radius(name):
         return values, label
-    return (
-        (growth.from_radius(values), growth.label)
-        if growth.label.endswith("[1/s]")
-        else (values - 1, f"{label} minus 1")
-    )
+    timed = growth.label.endswith("[1/s]")
+    return (growth.from_radius(values), growth.label) if timed else (values - 1, f"{label} minus 1")
 
 
 def half_play(dataset: xr.Dataset) -> float | None:

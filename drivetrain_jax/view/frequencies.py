@@ -239,9 +239,8 @@ def displacements(shape: Mapping[str, float], planets: int) -> tuple[np.ndarray,
     place, and the centres of the planets move with the carrier.
     """
     central = [[shape.get(f"x_{body}", 0.0), shape.get(f"y_{body}", 0.0), shape[f"u_{body}"]] for body in "crs"]
-    moved = [
-        [shape.get(f"xi_{i}", 0.0), shape.get(f"eta_{i}", shape["u_c"]), shape[f"u_{i}"]] for i in range(1, planets + 1)
-    ]
+    numbers = range(1, planets + 1)
+    moved = [[shape.get(f"xi_{i}", 0.0), shape.get(f"eta_{i}", shape["u_c"]), shape[f"u_{i}"]] for i in numbers]
     scale = _LARGEST / max(np.abs(central).max(), np.abs(moved).max(), 1e-300)
     return scale * np.array(central), scale * np.array(moved)
 
@@ -271,8 +270,8 @@ def _draw_gear(axes: Axes, shape: Mapping[str, float], angles: Sequence[float]) 
     for name, centre, (x, y, rotation), radius, lines in bodies:
         for line in lines:
             displaced = centre + x + 1j * y + line * np.exp(1j * rotation / radius)
-            rest.append(np.stack([(centre + line).real, (centre + line).imag], axis=-1))
-            moved.append(np.stack([displaced.real, displaced.imag], axis=-1))
+            for drawn, place in ((rest, centre + line), (moved, displaced)):
+                drawn.append(np.stack([place.real, place.imag], axis=-1))
             colours.append(_BODIES[name])
     axes.add_collection(LineCollection(rest, colors=FRAME_GREY, **_REST))
     axes.add_collection(LineCollection(moved, colors=colours, linewidths=1.1))
@@ -407,8 +406,8 @@ def _shafts(dataset: xr.Dataset) -> Figure:
         name = next((name for name in _SPEEDS if name in dataset), None)
         text = f"mode {dataset['mode'].values[index]}"
         if name:
-            value = f"{dataset[name].values[index]:.5g} {units_of(dataset[name])}"
-            text += f": {dataset[name].attrs.get('long_name', name)} {value}"
+            described = dataset[name].attrs.get("long_name", name)
+            text += f": {described} {dataset[name].values[index]:.5g} {units_of(dataset[name])}"
         axes.set_title(text, loc="left", pad=3, color=FRAME_GREY, size=8)
     distance = in_brackets(unit_of(dataset, "length", "m")[1]) if thickness else ", fraction of the length"
     sheet.label(f"distance from A{distance}", "deflection, largest 1")
@@ -441,9 +440,7 @@ def _shaft(dataset: xr.Dataset) -> tuple[list[float], list[float], dict[str, lis
     return edges, (_THICKNESS * diameters / diameters.max()).tolist(), points
 
 
-def _draw_shaft(
-    sheet: Sheet, axes: Axes, edges: list[float], thickness: list[float], points: dict[str, list[float]]
-) -> None:
+def _draw_shaft(sheet: Sheet, axes: Axes, edges: list[float], thickness: list[float], points: dict[str, Any]) -> None:
     """Draw the segments as grey boxes about the axis, and the symbols of the points."""
     for left, right, height in zip(edges, edges[1:], thickness, strict=False):
         box = (left, -height / 2), right - left, height

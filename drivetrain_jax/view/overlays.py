@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,7 +51,9 @@ def predictions(dataset: xr.Dataset, horizontal: str, vertical: str | None = Non
     lines, shown = [], BUILT_IN.get(str(dataset.attrs.get("analysis")), Declared()).predicted
     families = json.loads(dataset.attrs.get("resonance_families", "{}"))
     for index, label in enumerate(dataset["resonance"].values.astype(str)):
-        family = _family(label, families)
+        # The family with the longest matching prefix, else one named by the first letter.
+        prefixes = [prefix for prefix in families if label.startswith(prefix)]
+        family = families[max(prefixes, key=len)] if prefixes else {"name": label[:1]}
         if not family.get("drawn", True) or (shown == "forced" and not family.get("forced")):
             continue
         values = dataset[name].isel(resonance=index)
@@ -60,12 +61,6 @@ def predictions(dataset: xr.Dataset, horizontal: str, vertical: str | None = Non
         dashes = _FAMILY_DASHES.get(family.get("line", ""), "-")
         lines.append(Prediction(label, np.atleast_1d(values.values), y, family["name"], dashes))
     return lines
-
-
-def _family(label: str, families: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The declared family of ``label`` with the longest matching prefix, else a family named by the first letter."""
-    prefixes = [prefix for prefix in families if label.startswith(prefix)]
-    return families[max(prefixes, key=len)] if prefixes else {"name": label[:1]}
 
 
 def label_text(label: str) -> str:

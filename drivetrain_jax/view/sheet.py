@@ -123,12 +123,7 @@ class Sheet:
         about = re.sub(r"(?<![,;]) | (?=[^\[]*\])", "\u00a0", "; ".join(filter(None, (caption(dataset), note))))
         about = "; ".join(filter(None, (about, dataset.attrs.get("proof"))))
         about = textwrap.fill(about, LETTERS, break_long_words=False, break_on_hyphens=False)
-        look: dict[str, Any] = {
-            "loc": "outside lower left",
-            "alignment": "left",
-            "borderpad": 0.0,
-            "columnspacing": 1.4,
-        }
+        look: dict[str, Any] = {"loc": "outside lower left", "alignment": "left", "borderpad": 0, "columnspacing": 1.4}
         for columns in range(len(entries) or 1, 0, -1):
             legend = figure.legend(handles=entries, ncols=columns, title=about, **look)
             # At other resolutions letters are a few percent wider.
@@ -171,9 +166,7 @@ def is_logarithmic(values: np.ndarray) -> bool:
 def cell_edges(values: np.ndarray) -> np.ndarray:
     """The ``n + 1`` edges of cells around ``n`` rising values: midpoints of neighbours (of logarithms on a logarithmic
     axis); outer cells are symmetric about their value."""
-    if is_logarithmic(values):
-        return np.exp(_midway(np.log(values)))
-    return _midway(values)
+    return np.exp(_midway(np.log(values))) if is_logarithmic(values) else _midway(values)
 
 
 def _midway(values: np.ndarray) -> np.ndarray:
@@ -206,20 +199,14 @@ def plain_decades(axes: Axes, which: str) -> None:
 
 
 def write_names(
-    axes: Axes,
-    points: Sequence[tuple[float, float]] | np.ndarray,
-    names: Sequence[str],
-    *,
-    above: bool = False,
-    offset: float = 3.0,
-    colours: Any = FRAME_GREY,
-    **look: Any,
+    axes: Axes, points: Any, names: Sequence[str], *, above: bool = False, offset: float = 3.0, **look: Any
 ) -> None:
     """Write ``names`` to the right of ``points`` (or ``above``), ``offset`` points away, with a line to a name that moved.
 
     Names keep the order of their points. Where there is no space for all, the first stay. ``look`` goes to
-    :meth:`matplotlib.axes.Axes.annotate`.
+    :meth:`matplotlib.axes.Axes.annotate`, but for ``colours``: one for all names, or one for each.
     """
+    colours = look.pop("colours", FRAME_GREY)
     colours = [colours] * len(names) if isinstance(colours, str) else list(colours)
     scale, spacing, axis = 72 / axes.figure.dpi, _SPACING[above], 0 if above else 1
     places = np.array([axes.transData.transform(point)[axis] for point in points]) * scale

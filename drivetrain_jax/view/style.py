@@ -169,9 +169,8 @@ def value_text(name: str, value: object, units: str = "1") -> str:
     factor, units = prefixed([entry for entry in entries if isinstance(entry, (int, float))], units)
     end = f" {written_units(units)}" if units not in ("1", "") else ""
     digits = "{:.5g}" if entries is value else "{:.6g}"
-    text = ", ".join(
-        power_of_ten(digits.format(x / factor)) if isinstance(x, (int, float)) else str(x) for x in entries
-    )
+    texts = (power_of_ten(digits.format(x / factor)) if isinstance(x, (int, float)) else str(x) for x in entries)
+    text = ", ".join(texts)
     return f"{symbol(name)} = [{text}]{end}" if entries is value else f"{symbol(name)} = {text}{end}"
 
 
