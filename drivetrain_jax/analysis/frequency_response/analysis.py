@@ -45,7 +45,6 @@ from drivetrain_jax.systems import ForcedModel, PiecewiseLinearOscillator, Syste
 # orbits to which Newton's method leads from rest there, and runs both ways over a ratio of 1.3, through folds. Newton's
 # method corrects the orbits at the speeds of the line. Orbits on branches that these do not meet are not found.
 
-
 _MOST_ORBITS, _MOST_SPECIAL = 7, 16
 # Ratio of neighbouring starts, most starts, steps of each branch, its longest step, and the tolerance of its integrations.
 _SPACING, _STARTS, _ATTEMPTS, _LONGEST, _RTOL = 1.15, 48, 150, 0.06, 1e-9
@@ -54,7 +53,6 @@ _EACH, _EACH_SPECIAL, _STEPS = 3, 4, 4096
 
 
 def _branch_variables(system: type[System]) -> tuple[Variable, ...]:
-    """Variables of the branches, in the units of the system's displacements."""
     assert system.displacements is not None  # System refuses a model of forced without them
     units, speed = system.state[0].units, system.parameter(system.role("speed")).units
     branch = ("branch",)
@@ -68,7 +66,6 @@ def _branch_variables(system: type[System]) -> tuple[Variable, ...]:
 
 
 def _branch_dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
-    """Orbits, displacements, folds and doublings."""
     assert system.displacements is not None
     numbers = tuple(range(1, _MOST_SPECIAL + 1))
     return (
@@ -80,7 +77,6 @@ def _branch_dimensions(system: type[System], request: Request, fixed: Mapping[st
 
 
 def _branch_solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
-    """The solver of lines."""
     solve = over_lanes(partial(_solve_branches, system, request))
     return (Solver("continuation", solve, seconds=1e-2, chunk=8, march=True, short_loops=True, lengthy=True),)
 
@@ -242,19 +238,12 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
     )
 
 
-def _shape(model: PiecewiseLinearOscillator) -> tuple[int, ...]:
-    """Shape of the batch: of all fields but the frequency."""
-    fields = (model.damping, model.stiffness, model.alpha, model.b, model.B0, model.B1, model.unbalance)
-    return jnp.broadcast_shapes(*(jnp.shape(field) for field in fields))
-
-
 def _solve(
     build: Callable[..., PiecewiseLinearOscillator], request: Request, values: Mapping[str, Any], effort: Array
 ) -> dict[str, Array]:
-    """A line; ``effort`` only orders the batches."""
     model = build(values)
     model.check_method(model.damps_play, request.method)
-    options, shape = request.options, _shape(model)
+    options, shape = request.options, exact_response.batch_shape(model)
     if request.method == "exact":
         results = _exact(model, request)
     elif request.method == "harmonic_balance":
@@ -272,12 +261,8 @@ def _solve(
 def _exact(model: PiecewiseLinearOscillator, request: Request) -> dict[str, Array]:
     """The frequencies in rising order, and indices back to the path."""
     rising, place = np.unique(np.asarray(model.omega), return_inverse=True)
-    motions = exact_response.sweeps(
-        replace(model, omega=rising),
-        most_periods=request.options["most_periods"],
-        rtol=request.options["rtol"],
-        integrals=not exact_response.INTEGRALS.isdisjoint(request.outputs),
-    )
+    integrals = not exact_response.INTEGRALS.isdisjoint(request.outputs)
+    motions = exact_response.sweeps(replace(model, omega=rising), **request.options, integrals=integrals)
     outcome = exact_response.worst(motions["outcome"])
     special = not _SPECIAL.isdisjoint(request.outputs)
     if special or any(name.startswith("branch_") for name in request.outputs):
@@ -293,7 +278,7 @@ def _exact_branch(
 ) -> tuple[dict[str, Array], Array]:
     """The branch through the first motion of period one of the sweep up, and flags of the frequencies where it is
     complete."""
-    shape = _shape(model)
+    shape = exact_response.batch_shape(model)
     lanes = int(np.prod(shape, dtype=int))
     single = motions["period_multiple"][:, 0].reshape(-1, lanes) == 1
     first = jnp.argmax(single, axis=0)
@@ -302,9 +287,8 @@ def _exact_branch(
     x = jnp.concatenate([state, jnp.asarray(rising)[first][None]])
     x = jnp.where(jnp.any(single, axis=0), x, jnp.nan)
     results, complete = exact_response.branch(model, rising, x, special=special, width=exact_response.WIDTH)
-    return {name: value.reshape(*value.shape[:2], *shape) for name, value in results.items()}, complete.reshape(
-        -1, *shape
-    )
+    results = {name: value.reshape(*value.shape[:2], *shape) for name, value in results.items()}
+    return results, complete.reshape(-1, *shape)
 
 
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:

@@ -34,7 +34,6 @@ from drivetrain_jax.systems import PiecewiseLinearOscillator
 # corrected: its parameter epsilon cancels). The mean drive does not enter at this order. Backbone ``omega = w0 + g rho``,
 # peak ``a = F/mu`` on it, folds ``4 g^2 rho^3 (F^2 - mu^2 rho) = F^4``. All functions broadcast over a trailing batch.
 
-
 MOST_ROOTS = 3
 _SMALL_RATIO = 1e-8
 

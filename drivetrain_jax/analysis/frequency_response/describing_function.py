@@ -83,7 +83,6 @@ def follow(roots: Array) -> Array:
 
 # Bias and equivalent stiffness at an amplitude.
 
-
 _BIAS_STEPS = 24
 
 
@@ -203,13 +202,6 @@ def peak(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Array:
     return unit * jnp.exp(bisect(beyond, -span, span))
 
 
-def _first_contact(model: PiecewiseLinearOscillator) -> Array:
-    """Amplitude at which the motion about the static position reaches a flank; below it the oscillator is linear."""
-    force, play = jnp.abs(model.B0) / model.stiffness, model.alpha * model.b
-    within = model.b - force / jnp.where(model.alpha > 0, model.alpha, 1.0)
-    return jnp.where(force <= play, within, force - play)
-
-
 def _resonance(model: PiecewiseLinearOscillator, stiffness: Array) -> Array:
     """Frequency at which the response equation has its minimum for an amplitude; 0 with heavy damping."""
     return jnp.sqrt(jnp.maximum(stiffness - model.damping**2 / 2, 0.0))
@@ -232,18 +224,16 @@ class Skeleton(NamedTuple):
 
 
 def _nodes(model: PiecewiseLinearOscillator, end: Array, far: float = _FAR) -> Array:
-    """Rising amplitudes from the first contact with a flank to ``end``, logarithmic up to ``far`` sizes of the motions."""
-    unit = _length(model)
+    """Rising amplitudes from the first contact with a flank to ``end``, logarithmic up to ``far`` sizes of the motions.
+
+    Below the first contact of the motion about the static position the oscillator is linear.
+    """
+    unit, force, play = _length(model), jnp.abs(model.B0) / model.stiffness, model.alpha * model.b
+    within = model.b - force / jnp.where(model.alpha > 0, model.alpha, 1.0)
     last = jnp.minimum(end, far * unit)
-    first = jnp.clip(_first_contact(model), _NEAR * unit, last / 2)
+    first = jnp.clip(jnp.where(force <= play, within, force - play), _NEAR * unit, last / 2)
     part = jnp.linspace(0.0, 1.0, _NODES).reshape(_NODES, *(1,) * end.ndim)
     return jnp.concatenate([first * (last / first) ** part[:-1], last[None], end[None]])
-
-
-def _half_width(model: PiecewiseLinearOscillator, amplitude: Array, stiffness: Array, end: Array) -> Array:
-    """Half the distance of the arms in omega^2, exactly 0 at the ``end`` where they meet."""
-    half = jnp.sqrt(jnp.maximum(_discriminant(model, amplitude, stiffness), 0.0))
-    return jnp.where((amplitude >= end) & (_resonance(model, stiffness) > 0), 0.0, half)
 
 
 def skeleton(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Skeleton:
@@ -272,7 +262,9 @@ def skeleton(model: PiecewiseLinearOscillator, shape: tuple[int, ...]) -> Skelet
     amplitudes = jnp.concatenate([jnp.zeros((1, *shape)), amplitudes])
     safe = jnp.maximum(amplitudes, _TINY)
     points = point_at(model, safe, bias_of(model, safe))
-    centre, half = points.stiffness - model.damping**2 / 2, _half_width(model, safe, points.stiffness, top)
+    centre = points.stiffness - model.damping**2 / 2
+    half = jnp.sqrt(jnp.maximum(_discriminant(model, safe, points.stiffness), 0.0))
+    half = jnp.where((safe >= top) & (_resonance(model, points.stiffness) > 0), 0.0, half)
     # The amplitude 0 lies below every solution, also without a drive.
     half = half.at[0].set(jnp.inf)
     return Skeleton(amplitudes, points, (centre - half, centre + half), top, turning, limit)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax.analysis.numerics.linear_algebra import solve, solve_oriented
+from drivetrain_jax.analysis.numerics.linear_algebra import eliminated, solve
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 _CROSSING_STEPS = 4
@@ -169,15 +169,6 @@ def contact(model: PiecewiseLinearOscillator, basis: Basis, x: Array) -> Contact
     return Contact(u, (crossings[:, 0], crossings[:, 1]), (weights[:, 0], weights[:, 1]))
 
 
-def linear_part(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array) -> tuple[Array, Array]:
-    """Inertia and damping forces of ``x``, and their derivative with respect to ``omega``."""
-    base = omega / basis.order
-    squares = (basis.orders**2).reshape(-1, *(1,) * (x.ndim - 1))
-    turned = jnp.tensordot(basis.derivative, x, 1)
-    force = model.damping * base * turned - base**2 * squares * x
-    return force, (model.damping * turned - 2 * base * squares * x) / basis.order
-
-
 def residual(
     model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array, touch: Contact
 ) -> tuple[Array, Array]:
@@ -185,8 +176,10 @@ def residual(
     above, below = touch.weights
     beyond = above * (touch.u - model.b) + below * (touch.u + model.b)
     spring = model.alpha * x + (1 - model.alpha) * jnp.tensordot(basis.projection, beyond, 1)
-    force, by_omega = linear_part(model, basis, x, omega)
-    force, drive = force + model.stiffness * spring, 2 * basis.order - 1
+    base, squares = omega / basis.order, (basis.orders**2).reshape(-1, *(1,) * (x.ndim - 1))
+    turned, drive = jnp.tensordot(basis.derivative, x, 1), 2 * basis.order - 1
+    force = model.damping * base * turned - base**2 * squares * x + model.stiffness * spring
+    by_omega = (model.damping * turned - 2 * base * squares * x) / basis.order
     if model.follows:
         by_omega = by_omega.at[drive].add(-2 * model.unbalance * omega)
     return force.at[0].add(-model.B0).at[drive].add(-model.amplitude(omega)), by_omega
@@ -252,7 +245,7 @@ def balance(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Arr
         touch = contact(model, basis, trial)
         force, _ = residual(model, basis, trial, omega, touch)
         unbalanced = norm(force)
-        change, negative = solve_oriented(jacobian(model, basis, omega, touch), force[:, None])
+        change, negative, _ = eliminated(jacobian(model, basis, omega, touch), force[:, None])
         change = change[:, 0]
         usable = jnp.all(jnp.isfinite(change), axis=0)
         # After a small step the residual is rounding, and need not decrease.
@@ -310,7 +303,6 @@ def drift(model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array
 # A disturbance obeys ``y'' + c' y' + k' s(t) y = 0`` with s = 1 in contact and s = alpha within the play. As s is constant
 # between crossings of the flanks, the transition over the period is a product of closed-form matrices. Hill's infinite
 # determinant converges to the same multipliers; their product is ``exp(-c' T)`` exactly.
-
 
 _BLOCKS = 8
 Rows = tuple[Array, Array, Array, Array]

@@ -21,23 +21,13 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis.impacts.motion import Matrix, apply, log_determinant, newton_correction, spectral_radius
-from drivetrain_jax.analysis.impacts.piecewise_march import (
-    FEW,
-    Lanes,
-    Motion,
-    allowed_steps,
-    few_steps,
-    locate,
-    prepare,
-    stays,
-)
+from drivetrain_jax.analysis.impacts.piecewise_march import Lanes, Motion, allowed_steps, locate, prepare, stays, step
 from drivetrain_jax.systems import PiecewiseLinearOscillator
 
 # Lanes on their way to attractors: they settle period by period, start searches, and confirm the results.
 #
 # A *lane* processes one point at a time, stores the states of the last 33 periods to guess the period multiple, and
 # accumulates the growth of a tangent for the Lyapunov exponent.
-
 
 # Decide if a motion approaches a periodic orbit that Newton's method found from one of its states.
 #
@@ -58,7 +48,6 @@ from drivetrain_jax.systems import PiecewiseLinearOscillator
 # slowly along one line, the direction of the slow multiplier. The map shows that no other orbit lies on this line: from
 # each of eight points between the orbit and the motion, one recurrence (two if the multiplier is negative) must lead
 # nearer to the orbit.
-
 
 # Tolerated remainder of the linearisation relative to the contraction 1 - rho.
 REMAINDER = 0.02
@@ -361,10 +350,8 @@ def blank(width: int) -> Lane:
     """Lanes without a point; :func:`enter` replaces all their values but the kinds."""
     real, whole, flag = jnp.zeros(width), jnp.zeros(width, jnp.int32), jnp.zeros(width, bool)
     pair, matrix = (real, real), (real, real, real, real)
-    motion, orbit = (
-        Motion(real, real + 1, real, real, real, matrix, whole, whole),
-        Orbit(real, real, matrix, real, real),
-    )
+    motion = Motion(real, real + 1, real, real, real, matrix, whole, whole)
+    orbit = Orbit(real, real, matrix, real, real)
     return Lane(
         whole, whole, motion, whole, whole, pair, pair, real, whole, real, flag, whole, whole, whole,
         pair, pair, real, flag, orbit, whole, whole, whole,
@@ -381,8 +368,8 @@ _ASTRAY, _COSTLY = 3.0, 4
 # the natural frequency and damping down to 1e-4, 62 need at most 5e5, and the others do not repeat within 2e6.
 _BUDGET, _PER_PERIOD = 4e5, 100
 _EPS = np.finfo(float).eps
-# Rounding of a period over that of the states at its steps.
-_GROWTH = 64
+# Rounding of a period over that of the states at its steps, and steps between two looks at the lanes.
+_GROWTH, _FEW = 64, 8
 
 
 class Attractors(NamedTuple):
@@ -416,6 +403,12 @@ def take(oscillator: PiecewiseLinearOscillator, index: Array) -> PiecewiseLinear
     """The oscillators at the positions ``index``; fields common to all stay scalars."""
     chosen = {f.name: getattr(oscillator, f.name) for f in fields(oscillator)}
     return replace(oscillator, **{name: x[index] if jnp.ndim(x) else x for name, x in chosen.items()})
+
+
+def repeated(oscillator: PiecewiseLinearOscillator, times: int) -> PiecewiseLinearOscillator:
+    """All oscillators ``times`` times; fields common to all stay scalars."""
+    values = {name: jnp.tile(x, times) for name, x in vars(oscillator).items() if name != "omega" and jnp.ndim(x)}
+    return replace(oscillator, **values)
 
 
 class _Verdict(NamedTuple):
@@ -454,12 +447,10 @@ def _shoot(
     # At the limit of rounding, what is left may be as large as the last change and more.
     orbit = Orbit(*guess, motion.matrix, contraction, 2 * change + rounding)
     stable = now & converged & attracts(orbit)
-    slow = (
-        stable & is_slow(orbit, lane.latest, omega) & ~linearisation_holds(orbit, lane.latest, first, local.b, omega)[0]
-    )
-    corrected = lane._replace(
-        guess=guess, first=first, change=change, corrections=lane.corrections + now.astype(jnp.int32)
-    )
+    holds, _ = linearisation_holds(orbit, lane.latest, first, local.b, omega)
+    slow = stable & is_slow(orbit, lane.latest, omega) & ~holds
+    corrections = lane.corrections + now.astype(jnp.int32)
+    corrected = lane._replace(guess=guess, first=first, change=change, corrections=corrections)
     lane = restart(select(going, corrected, lane), going, *guess, lane.multiple)
     return lane, _Verdict(stable & ~slow, slow, orbit, now & ~going & ~stable)
 
@@ -538,8 +529,12 @@ def _tick(task: _Task, work: _Work) -> _Work:
     local = take(task.oscillator, task.visits[place])
     lanes = prepare(local)
     omega = lanes.omega + jnp.zeros(place.shape)
-    lane = lane._replace(motion=few_steps(lanes, lane.motion), spent=lane.spent + FEW)
-    broken = ~jnp.isfinite(lane.motion.u) | (lane.motion.steps > _most_steps(lane, lanes))
+    motion = jax.lax.fori_loop(0, _FEW, lambda _, motion: step(lanes, motion), lane.motion)
+    lane = lane._replace(motion=motion, spent=lane.spent + _FEW)
+    # A lane that moves from event to event without progress is stopped.
+    searching = lane.searching & (lane.count > 0)
+    most = lane.multiple * jnp.where(searching, _COSTLY * lane.cost + 500, allowed_steps(lanes))
+    broken = ~jnp.isfinite(motion.u) | (motion.steps > most)
     broken |= lane.spent > _BUDGET + _PER_PERIOD * task.most_periods
     ready = working & ((lane.motion.left <= 0) | broken)
     shot, probed = (ready & lane.searching & ~broken & (on == (lane.probing >= 0)) for on in (False, True))
@@ -561,12 +556,6 @@ def _tick(task: _Task, work: _Work) -> _Work:
     store = work.store.at[:, jnp.where(done, place, total)].set(rows, mode="drop")
     lane, queue = _proceed(after, done, result, work.queue, task)
     return _Work(lane, record(history, done, lane), queue, store)
-
-
-def _most_steps(lane: Lane, lanes: Lanes) -> Array:
-    """Steps after which a lane is stopped, because it moves from event to event without progress."""
-    searching = lane.searching & (lane.count > 0)
-    return lane.multiple * jnp.where(searching, _COSTLY * lane.cost + 500, allowed_steps(lanes))
 
 
 def _result(lane: Lane, reached: Array, stalled: Array, span: Array) -> Attractors:

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis._base import Outcome
-from drivetrain_jax.analysis.impacts.attractor import Attractors, attractors, averaged, take
+from drivetrain_jax.analysis.impacts.attractor import Attractors, attractors, averaged, repeated, take
 from drivetrain_jax.analysis.impacts.motion import (
     ABSENT,
     REGIMES,
@@ -87,10 +87,8 @@ def describe(
     known = outcome < Outcome.NOT_CONVERGED
     results |= {name: jnp.where(periodic, results[name], jnp.nan) for name in ("floquet_multiplier", "spectral_radius")}
     results["lyapunov_exponent"] = jnp.where(periodic, results["lyapunov_exponent"], motions.exponent)
-    results |= {
-        "orbit_state": jnp.stack([motions.u, motions.v]),
-        "state_error": jnp.where(periodic, motions.error, jnp.nan),
-    }
+    results["orbit_state"] = jnp.stack([motions.u, motions.v])
+    results["state_error"] = jnp.where(periodic, motions.error, jnp.nan)
     results = {name: jnp.where(known, value, jnp.nan) for name, value in results.items()}
     kind = jnp.where(periodic, regime(oscillator, seen.high, seen.low), NON_PERIODIC)
     return results | {
@@ -130,10 +128,15 @@ def periodic_results(oscillator: PiecewiseLinearOscillator, seen: Measures) -> d
     }
 
 
+def batch_shape(model: PiecewiseLinearOscillator) -> tuple[int, ...]:
+    """Shape of the batch: of all fields but the frequency."""
+    fields = (model.damping, model.stiffness, model.alpha, model.b, model.B0, model.B1, model.unbalance)
+    return jnp.broadcast_shapes(*(jnp.shape(field) for field in fields))
+
+
 def points_of(model: PiecewiseLinearOscillator, length: int, lanes: int) -> PiecewiseLinearOscillator:
     """The oscillators of all points, frequencies first: fields of shape ``(length * lanes,)``, or scalars."""
-    tiled = {name: jnp.tile(x, length) for name, x in vars(model).items() if name != "omega" and jnp.ndim(x)}
-    return replace(model, **tiled).driven_at(jnp.repeat(jnp.asarray(model.omega), lanes))
+    return repeated(model, length).driven_at(jnp.repeat(jnp.asarray(model.omega), lanes))
 
 
 def sweeps(
@@ -146,8 +149,7 @@ def sweeps(
     axis (flank, multiplier, state). Without lanes the last axis is missing. If a motion has not settled after
     ``most_periods`` drive periods, the next frequency starts from its last state.
     """
-    shape = jnp.broadcast_shapes(*(jnp.shape(getattr(model, n)) for n in ("damping", "stiffness", "alpha", "b")))
-    shape = jnp.broadcast_shapes(shape, jnp.shape(model.B0), jnp.shape(model.B1), jnp.shape(model.unbalance))
+    shape = batch_shape(model)
     length, lanes = jnp.size(model.omega), int(np.prod(shape, dtype=int))
     points = points_of(model, length, lanes)
     up = np.arange(length * lanes, dtype=np.int32).reshape(length, lanes).T
@@ -178,7 +180,6 @@ def worst(outcome: Array) -> Array:
 # the ends of the line (:mod:`~drivetrain_jax.analysis.numerics.continuation`). Newton's method corrects the orbits at
 # the frequencies of the line. Orbits of longer periods and closed branches are not included.
 
-
 BRANCHES, SPECIAL = 7, 16
 _ATTEMPTS, _LONGEST = 3000, 0.04
 # Relative difference for the derivative by omega.
@@ -202,8 +203,7 @@ def _period_map(model: PiecewiseLinearOscillator) -> PeriodMap:
 
     def mapped(x: Array) -> Mapped:
         omega = jnp.concatenate([x[2], x[2] * (1 + _DIFFERENCE)])
-        twice = {name: jnp.tile(value, 2) for name, value in vars(model).items() if name != "omega" and jnp.ndim(value)}
-        lanes = prepare(replace(model, **twice).driven_at(omega))
+        lanes = prepare(repeated(model, 2).driven_at(omega))
         end = march(lanes, start(lanes, jnp.tile(x[0], 2), jnp.tile(x[1], 2), jnp.asarray(1, jnp.int32)), _MOST_STEPS)
         half = x.shape[1]
         state = jnp.stack([end.u, end.v])
@@ -228,8 +228,7 @@ def branch(
     frequency at least one way), all its orbits were found, and it has no more orbits, folds or doublings than the results.
     """
     low, high = float(omega[0]), float(omega[-1])
-    values = {name: jnp.tile(v, 2) for name, v in vars(model).items() if name != "omega" and jnp.ndim(v)}
-    both = replace(model, omega=1.0, **values)
+    both = replace(repeated(model, 2), omega=1.0)
     twice = jnp.tile(first, (1, 2))
     way = jnp.repeat(jnp.array([1.0, -1.0]), first.shape[1])
     limits = (low * (1 - 1e-9), high * (1 + 1e-9))

@@ -44,7 +44,6 @@ def imbalance(model: PiecewiseLinearOscillator, motion: tuple[Array, Array, Arra
 
 # Linear maps of the plane over lanes: matrices as four arrays ``(m11, m12, m21, m22)`` of shape ``(N,)``.
 
-
 # Four entries, row by row.
 Matrix = tuple[Array, ...]
 

@@ -13,6 +13,7 @@ effect of the excess on the velocity is corrected too.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -35,7 +36,6 @@ from drivetrain_jax.systems._models import sincos
 # ``[[1 - K P, S], [-K S, S']]`` is the transition matrix; its determinant is ``exp(-C d)``. Neither K = 0 nor critical
 # damping is singular in this form. As the spring force is continuous, the transition matrix of a motion is the product
 # of the transition matrices of its steps, with a factor where the damping jumps (:mod:`.piecewise_march`).
-
 
 _TINY = 1e-150
 # Largest |root| d for the Taylor series of the step response, and its number of terms.
@@ -72,11 +72,6 @@ def piece(oscillator: PiecewiseLinearOscillator, stiffness: Array, damping: Arra
     scale = oscillator.B1 / (detuning**2 + lag**2)
     fields = (stiffness, h, root, overdamped, slow, fast, rate, scale * detuning, scale * lag)
     return Piece(*jnp.broadcast_arrays(*(jnp.asarray(field) for field in fields)))
-
-
-def choose(condition: Array, first: Piece, second: Piece) -> Piece:
-    """``first`` in the lanes where ``condition`` holds, else ``second``."""
-    return Piece(*(jnp.where(condition, a, b) for a, b in zip(first, second, strict=True)))
 
 
 def _short_step_response(region: Piece, d: Array) -> Array:
@@ -170,8 +165,6 @@ _MOST_STEPS = 2e7
 # Distance from a flank, in half backlashes, within which a lane is carried over it; longest such step of a slow lane, in
 # radians of the region's fastest motion.
 _ON_FLANK, _RESTING_ARC = 4e-16, 0.1
-# Steps between two looks at the lanes.
-FEW = 8
 
 
 class Lanes(NamedTuple):
@@ -253,7 +246,7 @@ def locate(lanes: Lanes, u: Array) -> Here:
     """Region of the displacement ``u``: in contact beyond the flanks; in the gap between them, flanks included."""
     linear = lanes.flank < 0
     side = jnp.where(u > lanes.flank, 1.0, jnp.where(u < -lanes.flank, -1.0, 0.0))
-    region = choose(linear | (side != 0), lanes.contact, lanes.gap)
+    region = jax.tree.map(partial(jnp.where, linear | (side != 0)), lanes.contact, lanes.gap)
     force = lanes.mean + jnp.where(linear, 0.0, side * lanes.offset)
     return Here(jnp.where(linear, 2.0, side), region, force)
 
@@ -327,12 +320,8 @@ def advance(lanes: Lanes, here: Here, motion: Motion, d: Array) -> Motion:
     v = rate * y + impulse * pull + omega * (region.sine * cosine - region.cosine * sine)
     m11, m12, m21, m22 = motion.matrix
     p11, p21 = 1 - region.stiffness * step, -region.stiffness * impulse
-    m11, m12, m21, m22 = (
-        p11 * m11 + impulse * m21,
-        p11 * m12 + impulse * m22,
-        p21 * m11 + rate * m21,
-        p21 * m12 + rate * m22,
-    )
+    m11, m21 = p11 * m11 + impulse * m21, p21 * m11 + rate * m21
+    m12, m22 = p11 * m12 + impulse * m22, p21 * m12 + rate * m22
     overdue = _overdue(lanes, here, u, v, d)
     turned, kept = overdue * (lanes.contact.stiffness - lanes.gap.stiffness), 1.0
     if lanes.jump is not None:
@@ -392,11 +381,6 @@ def step(lanes: Lanes, motion: Motion) -> Motion:
     return jax.tree.map(lambda new, old: jnp.where(active, new, old), moved, motion)
 
 
-def few_steps(lanes: Lanes, motion: Motion) -> Motion:
-    """``motion`` after a fixed small number of steps."""
-    return jax.lax.fori_loop(0, FEW, lambda _, moving: step(lanes, moving), motion)
-
-
 def usual_steps(lanes: Lanes, span: float = np.inf) -> Array:
     """Number of steps that no drive period exceeds (measured: 5 per oscillation, up to 15 per crossing).
 
@@ -425,7 +409,6 @@ def march(lanes: Lanes, motion: Motion, most_steps: int) -> Motion:
 
 
 # States at given times and events of a motion from any start.
-
 
 DRIVE, BACK, NO_EVENT = range(3)
 

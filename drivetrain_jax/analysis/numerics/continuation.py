@@ -69,13 +69,6 @@ class _Solved(NamedTuple):
     steps: Array
 
 
-def _bordered(matrix: Array, slope: Array, row: Array, scale: Array) -> Array:
-    """Derivatives of ``F(y; p) - y`` in units of ``scale``, with ``row`` as last row, ``(n + 1, n + 1, N)``."""
-    inner = matrix - jnp.eye(matrix.shape[0])[:, :, None]
-    rows = jnp.concatenate([inner, slope[:, None]], axis=1) * scale / scale[:-1, None]
-    return jnp.concatenate([rows, jnp.broadcast_to(row, scale.shape)[None]])
-
-
 def _on_plane(period_map: PeriodMap, guess: Array, normal: Array, scale: Array, converged: float) -> _Solved:
     """The orbit on the plane through ``guess`` with the given ``normal`` (in units of ``scale``), by Newton's method."""
     n, lanes = guess.shape[0] - 1, guess.shape[1]
@@ -91,7 +84,10 @@ def _on_plane(period_map: PeriodMap, guess: Array, normal: Array, scale: Array, 
         image = period_map(jnp.where(open_, old.x, jnp.nan))
         ahead = jnp.sum(normal * (guess - old.x) / scale, axis=0)
         right = jnp.concatenate([(old.x[:-1] - image.end) / scale[:-1], ahead[None]])
-        system = _bordered(image.matrix, image.slope, normal, scale)
+        # Derivatives of F(y; p) - y in units of the scale, with the normal as last row.
+        inner = image.matrix - jnp.eye(n)[:, :, None]
+        rows = jnp.concatenate([inner, image.slope[:, None]], axis=1) * scale / scale[:-1, None]
+        system = jnp.concatenate([rows, jnp.broadcast_to(normal, scale.shape)[None]])
         step, along = jnp.moveaxis(solve(system, jnp.stack([right, last], axis=1)), 1, 0)
         tangent = along / jnp.sqrt(jnp.sum(along**2, axis=0))
         change = jnp.max(jnp.abs(step), axis=0)
@@ -177,7 +173,9 @@ def _going(front: _Front, limits: tuple[Array | float, Array | float]) -> Array:
 
 
 def _tests(matrix: Array) -> Array:
-    return jnp.stack([fold_test(matrix), doubling_test(matrix)])
+    """``det(1 - M)`` and ``det(1 + M)`` of matrices ``(n, n, ...)``: zero at a fold, and where a period doubles."""
+    eye = jnp.eye(matrix.shape[0]).reshape(*matrix.shape[:2], *(1,) * (matrix.ndim - 2))
+    return jnp.stack([determinant(eye - matrix), determinant(eye + matrix)])
 
 
 def _straight(front: _Front, there: _Solved) -> Array:
@@ -207,20 +205,6 @@ def _moved(
     )
 
 
-def _shifted(matrix: Array, sign: float) -> Array:
-    return determinant(jnp.eye(matrix.shape[0]).reshape(*matrix.shape[:2], *(1,) * (matrix.ndim - 2)) + sign * matrix)
-
-
-def fold_test(matrix: Array) -> Array:
-    """``det(1 - M)`` of matrices ``(n, n, ...)``: zero where a multiplier is 1."""
-    return _shifted(matrix, -1.0)
-
-
-def doubling_test(matrix: Array) -> Array:
-    """``det(1 + M)`` of matrices ``(n, n, ...)``: zero where a multiplier is -1."""
-    return _shifted(matrix, 1.0)
-
-
 def locate(period_map: PeriodMap, ends: tuple[Array, Array], tests: tuple[Array, Array], doubling: Array) -> Array:
     """``x`` at a fold or (where ``doubling``) a period doubling between two points of a branch, in every lane.
 
@@ -237,7 +221,7 @@ def locate(period_map: PeriodMap, ends: tuple[Array, Array], tests: tuple[Array,
         count, a, fa, b, fb, _, _ = state
         part = jnp.where(fb == fa, (a + b) / 2, b - fb * (b - a) / jnp.where(fb == fa, 1.0, fb - fa))
         solved = _on_plane(period_map, ends[0] + part * chord, normal, scale, 1e-12)
-        f = jnp.where(doubling, doubling_test(solved.matrix), fold_test(solved.matrix))
+        f = jnp.where(doubling, *_tests(solved.matrix)[::-1])
         opposite = f * fb < 0
         settled = jnp.abs(part - b) <= _LOCATED
         bracket = (jnp.where(opposite, b, a), jnp.where(opposite, fb, fa / 2), part, f)

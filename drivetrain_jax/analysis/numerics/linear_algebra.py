@@ -65,24 +65,19 @@ def solve(a: Array, b: Array) -> Array:
 
     Gauss-Jordan elimination with row exchanges; a singular matrix gives values that are not finite.
     """
-    return solve_oriented(a, b)[0]
+    return eliminated(a, b)[0]
 
 
 def determinant(a: Array) -> Array:
     """Determinant of ``a``, ``(n, n, ...) -> (...)``."""
     if a.shape[0] == 2:
         return a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
-    _, negative, size = _eliminated(a, a[:, :0])
+    _, negative, size = eliminated(a, a[:, :0])
     return jnp.where(negative, -size, size)
 
 
-def solve_oriented(a: Array, b: Array) -> tuple[Array, Array]:
-    """Solution of ``a x = b`` as in :func:`solve`, and flags of a negative determinant of ``a``, ``(...)``."""
-    return _eliminated(a, b)[:2]
-
-
-def _eliminated(a: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Solution of ``a x = b``, and sign (flags of negative ones) and modulus of the determinant of ``a``."""
+def eliminated(a: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Solution of ``a x = b`` as in :func:`solve`, and sign (flags of negative ones) and modulus of ``det a``."""
     n = a.shape[0]
     number = jnp.arange(n).reshape(n, *(1,) * (a.ndim - 2))
 
