@@ -1,4 +1,9 @@
-"""Write the validation pages; see the docstring of the package."""
+"""Generate docs/validation/<system>.md: published and computed values, and the reasons of their differences.
+
+    python -m benchmarks.validation [SYSTEM ...] [--full]      # --full: comparisons over whole charts, not samples
+
+Numbers of the package are compared with independent ones by NumPy and SciPy where that is feasible.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +11,12 @@ import argparse
 from collections.abc import Sequence
 from importlib import import_module
 
-import benchmarks.validation
-
 SYSTEMS = ("cardan", "driveline", "tripod", "bicardan", "planetary", "rattle")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Compute and write the pages of the given systems, by default of all systems."""
-    parser = argparse.ArgumentParser(description=benchmarks.validation.__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("systems", nargs="*", metavar="SYSTEM", help=f"one or more of {', '.join(SYSTEMS)}")
     parser.add_argument("--full", action="store_true", help="compare whole charts instead of samples")
     given = parser.parse_args(arguments)

@@ -38,21 +38,9 @@ _BUILT_IN = {
 }
 
 __all__ = [
-    "OUTCOME",
-    "RTOL",
-    "Analysis",
-    "Dimension",
-    "Outcome",
-    "Parameter",
-    "Request",
-    "Solver",
-    "Variable",
-    "analyses_of",
-    "analysis_names",
-    "forward_derivatives",
-    "get_analysis",
-    "over_lanes",
-]
+    "OUTCOME", "RTOL", "Analysis", "Dimension", "Outcome", "Parameter", "Request", "Solver", "Variable", "analyses_of",
+    "analysis_names", "forward_derivatives", "get_analysis", "over_lanes",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

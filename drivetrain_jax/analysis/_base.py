@@ -296,10 +296,8 @@ def checked_solvers(
         return tuple(analysis.solvers(system, request))
     path = analysis.path_axis(system, request) is not None
     sizes = {solver.name: len(solver.values) for solver in dimensions}
-    return tuple(
-        replace(solver, solve=_CheckedSolve(analysis, request, path, sizes, solver.solve))
-        for solver in analysis.solvers(system, request)
-    )
+    solvers = analysis.solvers(system, request)
+    return tuple(replace(s, solve=_CheckedSolve(analysis, request, path, sizes, s.solve)) for s in solvers)
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 # ``Phi`` is a smooth function of the parameters; multipliers and spectral radius are not. The direct solvers of
 # ``floquet`` compute it with two step sizes, whose difference estimates its error.
 
-
 # The interpolated result, and its error.
 PROPAGATOR, CHANGE = "propagator", "propagator_change"
 _SOLVED = (

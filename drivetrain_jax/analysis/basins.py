@@ -89,9 +89,8 @@ def shares(high: Array, low: Array, multiple: Array, outcome: Array) -> dict[str
     def next_kind(left: Array, _: None) -> tuple[Array, tuple[Array, Array, Array, Array]]:
         first = jnp.argmax(left, axis=0)[None]
         top, bottom, m = (jnp.take_along_axis(x, first, axis=0) for x in (high, low, multiple))
-        near = jnp.maximum(jnp.abs(high - top), jnp.abs(low - bottom)) <= _SAME * jnp.maximum(
-            jnp.abs(top), jnp.abs(bottom)
-        )
+        size = jnp.maximum(jnp.abs(top), jnp.abs(bottom))
+        near = jnp.maximum(jnp.abs(high - top), jnp.abs(low - bottom)) <= _SAME * size
         same = left & (multiple == m) & (near | ~periodic)
         return left & ~same, (same.sum(axis=0), top[0], bottom[0], m[0])
 

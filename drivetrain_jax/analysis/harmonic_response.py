@@ -31,7 +31,6 @@ _CHUNK = 16
 
 
 def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
-    """The requested results of all lanes, which are the last axis."""
     lanes, damping = lane_count(values, ""), request.options["damping_ratio"]
     model: DrivenSprings = system.models["harmonic_response"].build(values)
     modes = system_modes(model.springs, "auto", lanes)

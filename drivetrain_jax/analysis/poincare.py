@@ -54,7 +54,6 @@ from drivetrain_jax.systems import Flow, System
 #
 # The section of a chaotic motion differs for every number of steps: only the error of one strobe is meaningful.
 
-
 # Number of repeated strobes: of the section, and from the start.
 _TAKEN_AGAIN, EARLY = 8, 16
 # Relative distance from the section up to which errors are proportional.
@@ -322,7 +321,6 @@ def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]
 
 
 def _of_system(system: type[System]) -> dict[str, Any]:
-    """The section in the units of the system's state."""
     section = replace(VARIABLES[0], units=", ".join(c.units for c in system.state) or "1")
     return {"variables": (section, *VARIABLES[1:])}
 

@@ -42,7 +42,6 @@ from drivetrain_jax.systems import PiecewiseLinearOscillator, System, Underdampe
 # The map F over the period is differentiated along the orbit, by the state z at its start and by the fields p of the
 # oscillator. The orbit moves by ``dz = (1 - dF/dz)^-1 dF/dp dp``. Every result depends on both z and p.
 
-
 # At one frequency the unbalance is part of B1.
 _FIELDS = tuple(f.name for f in fields(PiecewiseLinearOscillator) if f.name not in ("unbalance", "damps_play"))
 # Fields whose range ends at zero: there the oscillator has other formulas, and no derivative.
@@ -87,16 +86,17 @@ def orbit_jacobians(
     if "orbit_state" in names:
         slopes["orbit_state"] = state
     ended = (_vector(here) == 0) & _ENDS
-    return {name: _chained(jnp.where(ended | ~periodic, jnp.nan, x), by_parameter) for name, x in slopes.items()}
+
+    def chained(slopes: Array) -> Array:
+        """``slopes @ by_parameter``, with 0 for products of 0 and NaN."""
+        known = jnp.where(ended | ~periodic, jnp.nan, slopes)
+        return jnp.sum(jnp.where(by_parameter == 0, 0.0, known[..., None] * by_parameter), axis=-2)
+
+    return {name: chained(x) for name, x in slopes.items()}
 
 
 def _vector(oscillator: PiecewiseLinearOscillator) -> Array:
     return jnp.stack([jnp.asarray(getattr(oscillator, name), float) for name in _FIELDS])
-
-
-def _chained(slopes: Array, by_parameter: Array) -> Array:
-    """``slopes @ by_parameter``, with 0 for products of 0 and NaN."""
-    return jnp.sum(jnp.where(by_parameter == 0, 0.0, slopes[..., None] * by_parameter), axis=-2)
 
 
 SAMPLES = 512

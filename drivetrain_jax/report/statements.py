@@ -46,26 +46,14 @@ def statements(
 
     Forced amplitudes in ``moved`` (default: among the results) are compared with ``limit``.
     """
-    coded = [v for v in _coded(dataset) if v.name != "outcome"]
+    results = [v for v in dataset.data_vars.values() if v.name != "outcome"]
     exact = [unstable_text(dataset, str(dim)) for dim in dataset["outcome"].dims] if ranges else []
     said = [f"{_capital(text)}." for text in exact if text]
-    said += [sentence for variable in coded for sentence in _about_codes(dataset, variable, ranges)]
+    said += [sentence for v in results if "flag_meanings" in v.attrs for sentence in _about_codes(dataset, v, ranges)]
     said += [f"{_capital(dataset.attrs['proof'])}."] if "proof" in dataset.attrs else []
     said += [*_about_growth(dataset), *(_about_limit(dataset if moved is None else moved, limit) if limit else ())]
-    said += [sentence for variable in _numbers(dataset) for sentence in _about_numbers(dataset, variable)]
+    said += [sentence for variable in results for sentence in _about_numbers(dataset, variable)]
     return [*said, *_about_orders(dataset), *_about_outcome(dataset), *_about_errors(dataset)]
-
-
-def _coded(dataset: xr.Dataset) -> list[xr.DataArray]:
-    return [v for v in dataset.data_vars.values() if "flag_meanings" in v.attrs]
-
-
-def _numbers(dataset: xr.Dataset) -> list[xr.DataArray]:
-    return [
-        v
-        for v in dataset.data_vars.values()
-        if v.dtype.kind == "f" and not str(v.name).endswith(_PLAIN) and set(dataset["outcome"].dims) <= set(v.dims)
-    ]
 
 
 def _about_codes(dataset: xr.Dataset, variable: xr.DataArray, ranges: bool) -> Iterator[str]:
@@ -106,12 +94,14 @@ def _main_axis(dataset: xr.Dataset, variable: xr.DataArray) -> xr.DataArray | No
 
 def _about_numbers(dataset: xr.Dataset, variable: xr.DataArray) -> Iterator[str]:
     """Smallest and largest value with their places; by label if the analysis adds a short dimension."""
-    inner = [dim for dim in variable.dims if dim not in dataset["outcome"].dims]
-    if len(inner) > 1 or (inner and variable.sizes[inner[0]] > MOST_RANGES):
+    if variable.dtype.kind != "f" or str(variable.name).endswith(_PLAIN):
         return
+    inner, axes = [dim for dim in variable.dims if dim not in dataset["outcome"].dims], set(dataset["outcome"].dims)
+    if len(inner) > 1 or (inner and variable.sizes[inner[0]] > MOST_RANGES) or not axes <= set(variable.dims):
+        return
+    name = _capital(variable.attrs.get("long_name", variable.name))
     if dataset["outcome"].size == 1:
-        values = ", ".join(map(digits, np.atleast_1d(variable.values).ravel()))
-        yield f"{_capital(variable.attrs.get('long_name', variable.name))}: {values}{_unit(variable)}."
+        yield f"{name}: {', '.join(map(digits, variable.values.ravel()))}{_unit(variable)}."
         return
     for k in range(variable.sizes[inner[0]] if inner else 1):
         part = variable.isel({inner[0]: k}) if inner else variable
@@ -119,15 +109,13 @@ def _about_numbers(dataset: xr.Dataset, variable: xr.DataArray) -> Iterator[str]
             continue
         finite = np.ma.masked_invalid(part.values)
         label = f", {str(inner[0]).replace('_', ' ')} {_label(variable, inner[0], k)}" if inner else ""
-        low, high = (np.unravel_index(int(f()), part.shape) for f in (finite.argmin, finite.argmax))
-        name = _capital(str(variable.attrs.get("long_name", variable.name)))
-        if part.values[low] == part.values[high]:
-            yield f"{name}{label}: {digits(part.values[low])}{_unit(variable)} throughout."
+        places = [np.unravel_index(int(f()), part.shape) for f in (finite.argmin, finite.argmax)]
+        low, high = (f"{digits(part.values[place])}{_unit(variable)}" for place in places)
+        if finite.min() == finite.max():
+            yield f"{name}{label}: {low} throughout."
             continue
-        ends = (
-            f"{digits(part.values[p])}{_unit(variable)} at {_place(dataset, part, p)}" for p in map(tuple, (low, high))
-        )
-        yield f"{name}{label}: from {' to '.join(ends)}."
+        first, last = (_place(dataset, part, place) for place in places)
+        yield f"{name}{label}: from {low} at {first} to {high} at {last}."
 
 
 def _about_growth(dataset: xr.Dataset) -> Iterator[str]:
@@ -145,11 +133,9 @@ def _about_growth(dataset: xr.Dataset) -> Iterator[str]:
     turns = math.log(2) / abs(math.log(factor))
     per_second, seconds = (f"{abs(rate):.4g} 1/s, ", f"{math.log(2) / abs(rate):.4g} s, ") if timed else ("", "")
     where = f" at {text}" if (text := _place(dataset, radius, tuple(map(int, place)))) else ""
-    start, most, ends = (
-        ("Unstable means that a small disturbance grows", "fastest", "doubles")
-        if rate > 0
-        else ("Stable means that every small disturbance dies out", "slowest", "halves")
-    )
+    start, most, ends = "Stable means that every small disturbance dies out", "slowest", "halves"
+    if rate > 0:
+        start, most, ends = "Unstable means that a small disturbance grows", "fastest", "doubles"
     most = f", {most}{where}" if where else ""
     yield f"{start}{most}: {per_second}by a factor {factor:.6g} per turn; it {ends} in {seconds}{turns:.4g} turns."
 
@@ -187,11 +173,10 @@ def _about_outcome(dataset: xr.Dataset) -> Iterator[str]:
     outcome = dataset["outcome"]
     counts = {word: int((outcome.values == code).sum()) for code, word in flag_words(outcome).items() if code}
     above = "have an error above the tolerance, so judge them by their error bound"
-    wrong = ", ".join(
-        f"{count:,} {above}" if word == "tolerance_not_met" else f"{word.replace('_', ' ')} {count:,}"
-        for word, count in counts.items()
-        if count
-    )
+    said = {word: f"{word.replace('_', ' ')} {count:,}" for word, count in counts.items() if count}
+    if "tolerance_not_met" in said:
+        said["tolerance_not_met"] = f"{counts['tolerance_not_met']:,} {above}"
+    wrong = ", ".join(said.values())
     points = f"{outcome.size:,} point{'s' if outcome.size != 1 else ''}"
     yield f"{points} computed, with these remarks: {wrong}." if wrong else f"{points} computed, all successfully."
 
@@ -227,9 +212,8 @@ def _about_orders(dataset: xr.Dataset) -> Iterator[str]:
 
 def _place(dataset: xr.Dataset, variable: xr.DataArray, place: tuple[Any, ...]) -> str:
     """``name = value unit`` for every swept parameter at one place of ``variable``."""
-    return ", ".join(
-        f"{name} = {value} {units}".removesuffix(" 1") for name, value, units in coordinates(dataset, variable, place)
-    )
+    parts = coordinates(dataset, variable, place)
+    return ", ".join(f"{name} = {value} {unit}".removesuffix(" 1") for name, value, unit in parts)
 
 
 def _label(variable: xr.DataArray, dim: Any, k: int) -> str:
@@ -276,28 +260,23 @@ Table = tuple[list[str], list[list[str]]]
 
 def values_tables(dataset: xr.Dataset) -> list[Table]:
     """Heads and rows of tables of a result of few points: one for the results of the same dimensions, a column each."""
-    shown = [
-        v
-        for v in dataset.data_vars.values()
-        if v.size <= _FEW_VALUES and v.dtype.kind in "fiub" and v.name != "outcome"
-    ]
+    numbers = [v for v in dataset.data_vars.values() if v.dtype.kind in "fiub" and v.name != "outcome"]
+    shown = [v for v in numbers if v.size <= _FEW_VALUES]
     if dataset["outcome"].size > FEW_POINTS or sum(v.size for v in shown) > _FEW_VALUES:
         return []
     alike: dict[tuple[Any, ...], list[xr.DataArray]] = {}
     for variable in shown:
         alike.setdefault(variable.dims, []).append(variable)
-    return [_values_table(dataset, variables) for variables in alike.values()]
-
-
-def _values_table(dataset: xr.Dataset, variables: list[xr.DataArray]) -> Table:
-    """A row for each place, with its coordinates and the value of every variable."""
-    first, units = variables[0], [units_of(v) for v in variables]
-    places = [coordinates(dataset, first, place) for place in np.ndindex(first.shape)]
-    head = [f"{name}{in_brackets(unit)}" for name, _, unit in places[0]] if places else []
-    head += [f"{str(v.name).replace('_', ' ')}{in_brackets(unit)}" for v, unit in zip(variables, units, strict=True)]
-    columns = [[value_text(v, value) for value in v.values.reshape(-1)] for v in variables]
-    rows = [[value for _, value, _ in place] + [c[k] for c in columns] for k, place in enumerate(places)]
-    return head, rows
+    tables = []
+    for variables in alike.values():
+        # A row for each place, with its coordinates and the value of every variable.
+        places = [coordinates(dataset, variables[0], place) for place in np.ndindex(variables[0].shape)]
+        head = [f"{name}{in_brackets(unit)}" for name, _, unit in places[0]] if places else []
+        head += [f"{str(v.name).replace('_', ' ')}{in_brackets(units_of(v))}" for v in variables]
+        columns = [[value_text(v, value) for value in v.values.reshape(-1)] for v in variables]
+        rows = [[value for _, value, _ in place] + [c[k] for c in columns] for k, place in enumerate(places)]
+        tables.append((head, rows))
+    return tables
 
 
 def value_text(variable: xr.DataArray, value: Any) -> str:

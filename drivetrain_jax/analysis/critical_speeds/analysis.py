@@ -40,9 +40,6 @@ from drivetrain_jax.analysis.critical_speeds.shapes import mode_shapes, normalis
 from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.systems import Shaft, System
 
-# Separation margins of critical speeds against a range of operating speeds: actual, and required by API 617.
-
-
 # Amplification factor below which a critical speed counts as critically damped (API 617, API 684).
 _DAMPED = 2.5
 # Factor of the formula, largest margin of a speed below the range, and the addition for a speed above it.
@@ -115,28 +112,22 @@ Build = Callable[[Mapping[str, Any]], Shaft]
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     options = request.options
     lacking = [name for name in ("relative_error", "mode_shape") if name in request.outputs]
-    if (
-        lacking
-        and options.get("order", 0)
-        and any(fixed.get(f"k_{place}_y") is not None for place in ("A", "D", "joint"))
-    ):
+    planes = any(fixed.get(f"k_{place}_y") is not None for place in ("A", "D", "joint"))
+    if lacking and planes and options.get("order", 0):
         raise InputError(f"outputs: {lacking[0]!r} is not computed for two planes; expected order = 0")
     if request.method == "krylov_determinant":
         for name in (name for name in _ADDITIONS if name in {p.name for p in system.parameters}):
             if fixed.get(name) != system.parameter(name).default:
                 written = f"fixed.{name} = {fixed[name]}" if name in fixed else name
-                raise InputError(
-                    f"{written}: not in the equations of krylov_determinant; expected the method certified"
-                )
+                allowed = "expected the method certified"
+                raise InputError(f"{written}: not in the equations of krylov_determinant; {allowed}")
         if 0.0 in np.ravel(fixed.get("rhoA", ())):
             raise InputError("fixed.rhoA: krylov_determinant needs mass in every segment; expected rhoA[i] > 0")
     low, high = options["operating_min"], options["operating_max"]
     margins = [name for name in ("separation_margin", "required_margin") if name in request.outputs]
     if high < low or (high == 0 and margins):
-        raise InputError(
-            f"options.operating_max = {high:g}: expected for {margins[0] if margins else 'the operating speeds'} a "
-            f"speed > 0, at least operating_min = {low:g}"
-        )
+        wanted = f"expected for {margins[0] if margins else 'the operating speeds'} a speed > 0"
+        raise InputError(f"options.operating_max = {high:g}: {wanted}, at least operating_min = {low:g}")
     dimensions = [Dimension("mode", "number of the mode", tuple(range(1, options["modes"] + 1)))]
     if "mode_shape" in request.outputs:
         x = tuple(float(value) for value in np.linspace(0.0, 1.0, options["stations"]))
@@ -185,17 +176,13 @@ def outcomes(shaft: Shaft, roots: Roots) -> Array:
 
 
 def _solve(build: Build, request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
-    """All requested results; for arrays of lanes the lanes are the last axis."""
     options = request.options
     shaft = _at_order(build(values), options.get("order", 0))
     certified = request.method == "certified"
     roots = (shaft_roots.find_roots if certified else shaft_roots.krylov_roots)(shaft, options["modes"])
     p = roots.q**2
-    results = {
-        **{name: p * unit for name, unit in _units(options).items()},
-        "count_certified": roots.certified.astype(jnp.int8),
-        "outcome": outcomes(shaft, roots),
-    }
+    results = {name: p * unit for name, unit in _units(options).items()}
+    results |= {"count_certified": roots.certified.astype(jnp.int8), "outcome": outcomes(shaft, roots)}
     if "relative_error" in request.outputs:
         results["relative_error"] = shaft_roots.relative_error(shaft, roots)
     if "separation_margin" in request.outputs:

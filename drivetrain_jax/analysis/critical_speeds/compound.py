@@ -39,7 +39,6 @@ from drivetrain_jax.systems._models import horner, sincos
 
 # The segments of a shaft with their nodes, in the units in which the propagation runs.
 
-
 # Phase of a segment without mass over that of all others, where it need only be negligible: its effect is the fourth power.
 _FAINT = 1e-12
 
@@ -62,7 +61,9 @@ class Scales(NamedTuple):
     @classmethod
     def from_shaft(cls, shaft: Shaft, faint: bool = False) -> Scales:
         """The scales of ``shaft``."""
-        massless, mean = shaft.rhoA == 0, _mean_mass(shaft.rhoA)
+        massless, mean = shaft.rhoA == 0, jnp.mean(shaft.rhoA, axis=0)
+        # The mean, 1 if no segment has mass. Other masses would give scales the lanes of other parameters.
+        mean = jax.lax.stop_gradient(jnp.where(mean == 0, 1.0, mean))
         b = jnp.sqrt(jnp.sqrt(jnp.where(massless, mean, shaft.rhoA) / shaft.EI))
         if faint:
             phase = jnp.sum(jnp.where(massless, 0.0, shaft.length * b), axis=0)
@@ -72,12 +73,6 @@ class Scales(NamedTuple):
         e1 = b * shaft.EI
         # Not the number 0: derivatives by rhoA pass here.
         return cls(shaft.length * b, b, e1, b * e1, b * b * e1, jnp.where(massless, shaft.rhoA / mean, 1.0))
-
-
-def _mean_mass(rhoA: Array) -> Array:
-    """The mean of all segments, 1 if none has mass. Other masses would give scales the lanes of other parameters."""
-    mean = jnp.mean(rhoA, axis=0)
-    return jax.lax.stop_gradient(jnp.where(mean == 0, 1.0, mean))
 
 
 class Segment(NamedTuple):
@@ -172,7 +167,6 @@ def between(scale: Array) -> Array:
 # transfer matrix forms numerically, losing ``exp(z)``; here they are formed analytically. All results are multiplied by
 # ``exp(-growth)``. A segment without mass has ``r = 0`` and the ``alpha`` of any other mass; its entries are
 # polynomials of z, right to the first order in r for derivatives.
-
 
 # Five entries.
 Plane = tuple[Array, ...]

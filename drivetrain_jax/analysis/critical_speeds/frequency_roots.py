@@ -270,7 +270,6 @@ def relative_error(shaft: Shaft, roots: Roots) -> Array:
 # accuracy. At tau of about 11 pi, mode 12, all digits are gone and the scan finds roots of the rounding; at 355 it
 # overflows.
 
-
 POINTS_PER_MODE = 16
 _BISECTIONS = 54
 # Relative distance on either side of a root at which its number is counted.

@@ -93,9 +93,8 @@ def number_of_modes(shaft: Shaft) -> Array:
     """Number of natural frequencies, zero modes included, shape of the lanes: infinite if a segment has mass."""
     if shaft.k_y is not None:
         forward, backward = _in_planes(shaft)
-        return number_of_modes(forward) + number_of_modes(
-            backward._replace(spin=None if shaft.spin is None else -shaft.spin)
-        )
+        backward = backward._replace(spin=None if shaft.spin is None else -shaft.spin)
+        return number_of_modes(forward) + number_of_modes(backward)
     count = jnp.zeros(shaft.k.shape[1:], int)
     if shaft.m is not None:
         count = count + jnp.sum((shaft.m > 0) & jnp.isfinite(shaft.k), axis=0)

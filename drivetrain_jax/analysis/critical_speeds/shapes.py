@@ -194,7 +194,6 @@ def across_joints(shaft: Shaft, q: Array) -> Links:
 # right: those are taken that differ most in their places, so that each moves one of the spans that hinges on rigid
 # supports separate.
 
-
 # Relative distance up to which q belong to a cluster: a double root of Psi is known to the root of rounding only.
 _CLOSE = 1e-7
 # Relative distance up to which q are equal, and the one by which places part them.
@@ -321,17 +320,13 @@ _ROUNDING = 1024 * np.finfo(float).eps
 _MIRROR = np.array([1.0, -1.0, 1.0, -1.0])
 
 
-def _left(u: Plane) -> Array:
-    """The plane as the antisymmetric matrix of its minors, rows f, theta, M, F, shape ``(4, 4, ...)``."""
-    return _antisymmetric(u[0], u[1], -u[2], u[3], u[4])
-
-
 def _right(u: Plane) -> Array:
-    """The same from the plane of the mirrored shaft: theta and F change their sign."""
+    """The matrix of the plane of the mirrored shaft: theta and F change their sign."""
     return _antisymmetric(-u[0], u[1], u[2], u[3], -u[4])
 
 
 def _antisymmetric(y12: Array, y13: Array, y14: Array, y24: Array, y34: Array) -> Array:
+    """A plane as the antisymmetric matrix of its minors, rows f, theta, M, F, shape ``(4, 4, ...)``."""
     o = jnp.zeros_like(y12)
     rows = ((o, y12, y13, y14), (-y12, o, y14, y24), (-y13, -y14, o, y34), (-y14, -y24, -y34, o))
     return jnp.stack([jnp.stack(row) for row in rows])
@@ -346,7 +341,8 @@ def _shared_states(left: Plane, right: Plane) -> tuple[Array, Array, Array]:
     """
     # w R: F_v f_w - f_v F_w + theta_v M_w - M_v theta_w.
     R = _right(right)
-    product = matmul(_left(left), jnp.stack([-R[3], R[2], -R[1], R[0]]))
+    L = _antisymmetric(left[0], left[1], -left[2], left[3], left[4])
+    product = matmul(L, jnp.stack([-R[3], R[2], -R[1], R[0]]))
     diagonal = jnp.stack([product[i, i] for i in range(4)])
     best = jnp.argmax(jnp.abs(diagonal), axis=0)
     chosen = [best == i for i in range(4)]

@@ -81,15 +81,9 @@ def direct_solvers(
             return results(model, over_lanes(one)(values, panels), factors)
 
         return Solver(
-            f"direct: Gauss collocation of order 10{name}",
-            solve,
-            effort,
-            lambda values: traced_panels(build, values, rtol),
-            seconds=1e-6,
-            chunk=chunk,
-            march=True,
-            short_loops=True,
-        )
+            f"direct: Gauss collocation of order 10{name}", solve, effort, lambda values: traced_panels(build, values, rtol),
+            seconds=1e-6, chunk=chunk, march=True, short_loops=True,
+        )  # fmt: skip
 
     def effort(columns: Mapping[str, Any], strong: bool) -> np.ndarray:
         panels = panels_needed(system, columns, rtol)
@@ -164,10 +158,6 @@ def _derivatives(
     return jacobians
 
 
-def _lacks(system: type[System]) -> dict[str, str]:
-    return lacks(system) | ({} if "atlas" in system.models else {"atlas": f"{system.name} has no model for it"})
-
-
 ANALYSIS = Analysis(
     name="floquet",
     title="Floquet stability of the equilibrium",
@@ -188,7 +178,10 @@ ANALYSIS = Analysis(
     ),
     solvers=_solvers,
     dimensions=lambda *_: (Dimension("multiplier", "number of the multiplier, by falling modulus", ()),),
-    lacks=_lacks,
+    lacks=lambda system: {
+        **lacks(system),
+        **({} if "atlas" in system.models else {"atlas": f"{system.name} has no model for it"}),
+    },
     undecided="the spectral radius is 1 within its error: a smaller rtol than {rtol:g} may decide",
     derivatives=_derivatives,
     once="floquet: got a second derivative, expected a first; take differences of the gradient",

@@ -15,7 +15,7 @@ from jax import Array
 
 from drivetrain_jax.analysis._base import Outcome, Request, Solver
 from drivetrain_jax.analysis.floquet.direct import Monodromy, Propagator, compare, unknown
-from drivetrain_jax.analysis.floquet.effort import stable_steps, steps_needed, traced_panels, traced_steps
+from drivetrain_jax.analysis.floquet.effort import STEPS, stable_steps, steps_needed, traced_panels
 from drivetrain_jax.analysis.floquet.propagator import EqualStepSize, LinearTerm, march
 from drivetrain_jax.analysis.floquet.results import NEED_ERROR, results
 from drivetrain_jax.analysis.numerics.lanes import Constants, lanes_last, over_lanes
@@ -57,8 +57,12 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
         shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in jax.tree.leaves(dict(values)) if not isinstance(x, str)))
         order = solver.order(model.reduced)
 
+        def one(point: Mapping[str, Any], steps: Array) -> Array:
+            parts = [_in_equal_steps(part, solver, steps) for part in build(point).reduced.parts]
+            return reduce(lambda before, after: after @ before, parts)
+
         def propagate(steps: Array) -> Array:
-            return over_lanes(lambda point, steps: _in_equal_steps(build(point).reduced, solver, steps))(values, steps)
+            return over_lanes(one)(values, steps)
 
         records = over_lanes(partial(_records, build))(values, jnp.max(traced_panels(build, values, _OF_RECORDS)))
         steps = jnp.maximum(steps, jnp.ceil(stable_steps(model.reduced)).astype(steps.dtype))
@@ -73,20 +77,11 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
 
     def steps(values: Mapping[str, Any]) -> Array:
         order = solver.order(diffrax.ODETerm(lambda t, y, args: y))
-        count = rtol ** (1 / 8 - 1 / order) * traced_steps(build, values, rtol)
+        count = rtol ** (1 / 8 - 1 / order) * jnp.ceil(STEPS * traced_panels(build, values, rtol))
         return jnp.minimum(count, MAX_STEPS).astype(jnp.int64)
 
-    return (
-        Solver(
-            f"diffrax: {request.options['solver']}, equal steps",
-            solve,
-            effort,
-            steps,
-            seconds=1e-6,
-            chunk=256,
-            march=True,
-        ),
-    )
+    name = f"diffrax: {request.options['solver']}, equal steps"
+    return (Solver(name, solve, effort, steps, seconds=1e-6, chunk=256, march=True),)
 
 
 def _records(build: Build, values: Mapping[str, Any], panels: Array, natural: bool = False) -> Propagator:
@@ -171,14 +166,10 @@ def adaptive_steps(system: type[System], request: Request) -> tuple[Solver, ...]
 
 
 def _in_equal_steps(form: LinearPeriodic, solver: diffrax.AbstractSolver, steps: Array) -> Array:
-    """The propagator of one point by ``steps`` equal steps.
+    """The propagator of one point between breakpoints by ``steps`` equal steps.
 
     Under ``jax.vmap`` the lanes are the last axis of a single state, which halves the time of ``solver``.
     """
-    return reduce(lambda before, after: after @ before, [_of_part(part, solver, steps) for part in form.parts])
-
-
-def _of_part(form: LinearPeriodic, solver: diffrax.AbstractSolver, steps: Array) -> Array:
     arrays, rest = eqx.partition(LinearPeriodic(form.rows, form.span, form.basis), eqx.is_array)
     if form.is_pytree:
         return lanes_last(_integrated, Constants((rest, solver)), arrays, steps)
@@ -194,18 +185,9 @@ def _integrated(constants: Constants, arrays: LinearPeriodic, steps: Array) -> A
     # Lanes of different spans share a clock whose unit is the span.
     scaled = diffrax.ODETerm(lambda t, y, args: form.span * form.vf(form.span * t, y, args))
     solution = diffrax.diffeqsolve(
-        scaled,
-        solver,
-        t0=0.0,
-        t1=1.0,
-        dt0=None,
-        y0=start,
-        stepsize_controller=EqualStepSize(steps),
-        saveat=diffrax.SaveAt(t1=True),
-        adjoint=diffrax.ForwardMode(),
-        max_steps=None,
-        throw=False,
-    )
+        scaled, solver, 0.0, 1.0, None, start, stepsize_controller=EqualStepSize(steps), saveat=diffrax.SaveAt(t1=True),
+        adjoint=diffrax.ForwardMode(), max_steps=None, throw=False,
+    )  # fmt: skip
     return solution.ys[-1]  # pyright: ignore[reportOptionalSubscript]
 
 
@@ -221,20 +203,12 @@ def diffrax_propagator(
     """The propagator of one point over the span, NaN where the integration failed, and whether it succeeded."""
     matrix, success = jnp.eye(form.size), has_finite_entries(form)
     for part in form.parts:
+        # Without finite entries every step would be rejected, up to the last one.
+        end = jnp.where(success, part.span, 0.0)
         solution = diffrax.diffeqsolve(
-            LinearTerm(part),
-            solver,
-            t0=0.0,
-            # Without finite entries every step would be rejected, up to the last one.
-            t1=jnp.where(success, part.span, 0.0),
-            dt0=None,
-            y0=matrix,
-            saveat=diffrax.SaveAt(t1=True),
-            adjoint=diffrax.ForwardMode(),
-            max_steps=max_steps,
-            throw=False,
-            **options,
-        )
+            LinearTerm(part), solver, 0.0, end, None, matrix, saveat=diffrax.SaveAt(t1=True),
+            adjoint=diffrax.ForwardMode(), max_steps=max_steps, throw=False, **options,
+        )  # fmt: skip
         success &= solution.result == diffrax.RESULTS.successful
         matrix = solution.ys[-1]  # pyright: ignore[reportOptionalSubscript]
     return jnp.where(success, matrix, jnp.nan), success

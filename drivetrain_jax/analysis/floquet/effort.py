@@ -23,7 +23,7 @@ MAX_PANELS, MAX_STEPS = 400_000, 1_000_000
 # Panels of a model that is NaN somewhere in its span: it is solved all the same, so that its outcome becomes NOT_FINITE.
 _TO_FIND_NO_VALUE = 16
 # Steps of order 8 as accurate as one panel, and the decay in a step with which explicit schemes are stable.
-_STEPS, _STABLE = 2.5, 6.0
+STEPS, _STABLE = 2.5, 6.0
 
 Build = Callable[..., "FloquetModel"]
 
@@ -61,13 +61,8 @@ def traced_panels(build: Build, values: Mapping[str, Any], rtol: float) -> Array
 def steps_needed(system: type[System], columns: Mapping[str, Any], rtol: float) -> np.ndarray:
     """Steps of an explicit scheme of order 8, ``(N,)``; inf where there would be too many."""
     decay = predicted(_decay, (system.models["floquet"].build,), columns)
-    steps = np.maximum(_STEPS * panels_needed(system, columns, rtol), np.nan_to_num(decay) / _STABLE)
+    steps = np.maximum(STEPS * panels_needed(system, columns, rtol), np.nan_to_num(decay) / _STABLE)
     return np.where(steps <= MAX_STEPS, steps, np.inf)
-
-
-def traced_steps(build: Build, values: Mapping[str, Any], rtol: float) -> Array:
-    """Steps of an explicit scheme of order 8 for traced ``values``."""
-    return jnp.ceil(_STEPS * traced_panels(build, values, rtol)).astype(jnp.int64)
 
 
 def stable_steps(system: LinearPeriodic) -> Array:

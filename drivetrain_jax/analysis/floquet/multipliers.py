@@ -67,9 +67,8 @@ def characteristic_coefficients(z: Array) -> Array:
 
 def root(x: Array, k: int) -> Array:
     """The ``k``-th root of ``x``; powers cost more than square roots."""
-    return {1: lambda x: x, 2: jnp.sqrt, 3: jnp.cbrt, 4: lambda x: jnp.sqrt(jnp.sqrt(x))}.get(
-        k, lambda x: x ** (1 / k)
-    )(x)
+    roots = {1: lambda x: x, 2: jnp.sqrt, 3: jnp.cbrt, 4: lambda x: jnp.sqrt(jnp.sqrt(x))}
+    return roots.get(k, lambda x: x ** (1 / k))(x)
 
 
 def root_scale(coefficients: Array) -> Array:
@@ -119,10 +118,6 @@ def spectral_radius_bound(real: Array, imaginary: Array, error: PolynomialError)
     rho = over_first(jnp.maximum, modulus)
     inwards = over_first(jnp.minimum, jnp.where(modulus == rho, radii, jnp.inf))
     return jnp.maximum(over_first(jnp.maximum, radii - (rho - modulus)), inwards)
-
-
-def _diagonal(n: int, axes: int) -> Array:
-    return jnp.eye(n, dtype=bool).reshape(n, n, *(1,) * axes)
 
 
 def multiplier_errors(real: Array, imaginary: Array, error: PolynomialError, counted: Array | bool = True) -> Array:
@@ -196,7 +191,8 @@ def all_on_the_circle(real: Array, imaginary: Array, error: PolynomialError, sca
     radius = multiplier_errors(real, imaginary, error)
     gaps = jnp.hypot(real[:, None] - real, imaginary[:, None] - imaginary)
     # Four radii about a multiplier at the unit circle contain the reflection of its circle if that is below 0.1.
-    apart = _diagonal(len(real), real.ndim - 1) | (gaps > 4 * radius + radius[:, None])
+    itself = jnp.eye(len(real), dtype=bool).reshape(len(real), len(real), *(1,) * (real.ndim - 1))
+    apart = itself | (gaps > 4 * radius + radius[:, None])
     on_circle = (scale * radius < 0.1) & (jnp.abs(scale * jnp.hypot(real, imaginary) - 1) <= scale * radius)
     return over_first(jnp.logical_and, on_circle & over_first(jnp.logical_and, apart))
 

@@ -61,7 +61,6 @@ from drivetrain_jax.systems import Flow, PiecewiseLinearOscillator, System
 # Outcome: ``NOT_FINITE`` without a finite motion (resonance without damping; a fit with l1 <= 0); ``STEP_LIMIT`` for more
 # events than a motion can have unless it grazes a flank; ``slow_flow`` also ``TOLERANCE_NOT_MET``.
 
-
 _TIMES = ("times", "stop", "num")
 _PLAY_METHODS = {"exact": (*_TIMES, "most_events"), "slow_flow": (*_TIMES, "rtol", "solver", "fit_range")}
 _PLAY_TITLES = {
@@ -90,12 +89,6 @@ _STARTS = ("initial_displacement", "initial_rate")
 _MAX_PERIODS, _PLAY_CHUNK = 2_000_000, 64
 
 
-def _play_variables(system: type[System]) -> tuple[Variable, ...]:
-    """Variables of the state of ``system``, and those that the methods add."""
-    of_state = (Variable(c.name, c.units, c.long_name, ("time",)) for c in system.state)
-    return (*of_state, *_EXACT, *_AVERAGED)
-
-
 def _play_dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
     """Dimensions of times and events; raises ``InputError`` for a result that the method does not compute."""
     PiecewiseLinearOscillator.check_method(fixed.get("damping") != "contact", request.method)
@@ -108,7 +101,6 @@ def _play_dimensions(system: type[System], request: Request, fixed: Mapping[str,
 
 
 def _play_solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
-    """The solver of the method."""
     effort = partial(_effort, system, request, _MAX_PERIODS)
     if request.method == "exact":
         return (Solver("exact", partial(_exact, system, request), effort, chunk=_PLAY_CHUNK, lengthy=True),)
@@ -168,7 +160,6 @@ def averaged_flow(
 
 
 def _averaged(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
-    """The requested results of one point."""
     model: PiecewiseLinearOscillator = system.models["history"].build(values)
     model.check_method(model.damps_play, request.method)
     u0, v0 = (jnp.asarray(values[system.role(role)], float) for role in _STARTS)
@@ -239,8 +230,9 @@ def _of_system(system: type[System]) -> dict[str, Any]:
     # An oscillator with play is no flow.
     if system.models["history"].returns is PiecewiseLinearOscillator:
         shared = tuple(o for o in ANALYSIS.options if o.name in {o for used in _PLAY_METHODS.values() for o in used})
+        of_state = (Variable(c.name, c.units, c.long_name, ("time",)) for c in system.state)
         return {
-            "variables": _play_variables(system),
+            "variables": (*of_state, *_EXACT, *_AVERAGED),
             "default_outputs": names,
             "methods": _PLAY_METHODS,
             "method_titles": _PLAY_TITLES,

@@ -118,18 +118,10 @@ def _segment(
     atol = jnp.maximum(tolerance * size_of(flow), 1e-300)
     longest = part * (end - place.fraction)
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda s, y, _: flow.period * flow.vector(place.strobe, s, y)),
-        solver,
-        t0=place.fraction,
-        t1=end,
-        dt0=None,
-        y0=place.y,
-        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=atol, dtmax=longest),
-        saveat=diffrax.SaveAt(t1=True),
-        adjoint=diffrax.ForwardMode(),
-        max_steps=_MAX_SEGMENT,
-        throw=False,
-    )
+        diffrax.ODETerm(lambda s, y, _: flow.period * flow.vector(place.strobe, s, y)), solver, place.fraction, end, None,
+        place.y, stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=atol, dtmax=longest),
+        saveat=diffrax.SaveAt(t1=True), adjoint=diffrax.ForwardMode(), max_steps=_MAX_SEGMENT, throw=False,
+    )  # fmt: skip
     well = solution.result == diffrax.RESULTS.successful
     return solution.ys[0], solution.stats["num_steps"], well  # pyright: ignore[reportOptionalSubscript]
 
@@ -167,14 +159,9 @@ def trajectory(
         total = place.steps + steps
         healthy = place.healthy & well & (total <= limits.steps) & jnp.all(jnp.isfinite(y))
         y = jnp.where(healthy, y, place.y)
-        return _Place(
-            jnp.where(last, strobe, place.strobe + 1),
-            jnp.where(last, fraction, 0.0),
-            y,
-            jnp.maximum(place.reached, jnp.max(jnp.abs(y))),
-            total,
-            healthy,
-        )
+        reached = jnp.maximum(place.reached, jnp.max(jnp.abs(y)))
+        strobe, fraction = jnp.where(last, strobe, place.strobe + 1), jnp.where(last, fraction, 0.0)
+        return _Place(strobe, fraction, y, reached, total, healthy)
 
     def to(place: _Place, target: tuple[Array, Array]) -> tuple[_Place, Array]:
         place = jax.lax.while_loop(lambda p: _ahead(p, target), lambda p: advance(p, target), place)

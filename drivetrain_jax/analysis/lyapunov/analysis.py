@@ -64,7 +64,6 @@ from drivetrain_jax.systems import Flow, System
 # bounded, its field can be chaotic, the largest exponent exceeds three standard errors and agrees for two step sizes, the
 # exponents sum to the mean divergence, and the 0-1 test gives K > 0.9. Exponents of phases are ignored.
 
-
 CHAOTIC_K = 0.9
 # Least logarithmic growth that counts as exponential, over the averaged three quarters of the time: twice that of growth in
 # proportion to time, as at a double multiplier, which is a factor of four.
@@ -187,7 +186,6 @@ def _autonomous(evidence: Evidence) -> Array:
 #
 # A batch marches in lockstep: every member pays for the most steps per strobe and for the most strobes of all members.
 # One group for each range of steps bounds this product, so an extreme member does not multiply the work of the others.
-
 
 # Most steps of a run of up to a second with predicted steps, in proportion for a longer one: half a minute on one core. The
 # paper's scenes take 1e6 steps in 4 s, and the driveshaft at 10 Hz takes 3e6.
@@ -333,9 +331,8 @@ def run_twice(flow: Flow, steps: Any, max_time: float, target: float, members: A
     def one(active: Array, steps: Array) -> tuple[Array, Record]:
         record = record_growth(flow, steps, max_time, target, active, to_the_end=to_the_end)
         spectrum = spectrum_of(record)
-        return active & record.bounded & ~record.orbit.found & (
-            spectrum.values[0] > STANDARD_ERRORS * spectrum.errors[0]
-        ), record
+        positive = spectrum.values[0] > STANDARD_ERRORS * spectrum.errors[0]
+        return active & record.bounded & ~record.orbit.found & positive, record
 
     _, both = jax.lax.scan(one, members, jnp.stack([jnp.asarray(steps), jnp.maximum(steps // 2, 1)]))
     return Run(*(jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1)))
@@ -424,7 +421,6 @@ def _of_section(flow: Flow, steps: Any, fine: Record, findings: Findings, wanted
 
 
 def _outcome(fine: Record, findings: Findings, target: float) -> Array:
-    """The outcome of every member, int8."""
     values, errors = findings.spectrum.values, findings.spectrum.errors
     met = findings.resolved & ((target == 0) | ~fine.bounded | (jnp.max(errors, axis=0) <= target))
     outcome = jnp.where(met, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET)
@@ -432,7 +428,6 @@ def _outcome(fine: Record, findings: Findings, target: float) -> Array:
 
 
 def _of_spectrum(fine: Record, findings: Findings) -> dict[str, Array]:
-    """Results that follow from the records of growth."""
     spectrum = findings.spectrum
     history = running_mean(fine.growth, fine.used, fine.span)
     return {

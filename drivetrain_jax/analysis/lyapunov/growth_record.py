@@ -35,7 +35,6 @@ from drivetrain_jax.systems import Flow
 # damp or excite an oscillation, or that miss a fast decay, fail this test. Second, the largest exponent must be the
 # same with twice the step. Steps that perturb phases fail only this test, because they hardly change volume.
 
-
 STANDARD_ERRORS = 3.0
 # Largest residual of the sum rule relative to the largest exponent.
 SUM_RULE = 1e-3

@@ -27,7 +27,6 @@ from drivetrain_jax.systems import Flow
 #
 # A clock may turn without effect: the field does not contain it, or the amplitude of its forcing is zero.
 
-
 # Fractions of a strobe at which the clocks are tested; at none of them the derivative of a harmonic vanishes by symmetry.
 FRACTIONS = tuple((k + 0.37) / 8 for k in range(8))
 # Number of components of a flow that cannot be chaotic without a clock; a phase is a clock among the components.

@@ -22,7 +22,6 @@ from drivetrain_jax.systems import Flow
 # c), the mean square displacement M_c(n) = <(p(j+n) - p(j))^2 + (q(j+n) - q(j))^2> without its oscillating part <phi>^2
 # (1 - cos n c)/(1 - cos c) grows linearly in n if phi is chaotic. K is the median over c of its correlation with n.
 
-
 # As many angles as the authors use, equally spaced over their recommended range.
 _ANGLES = 100
 _RANGE = (math.pi / 5, 4 * math.pi / 5)
@@ -43,7 +42,7 @@ def chaos_k01(series: Array) -> Array:
     constant = ~(size > 1e-12 * jnp.abs(mean))
     # The test does not depend on the scale of the observable, and an offset only adds to the oscillating part.
     scaled = (series - mean) / jnp.where(constant, 1.0, size)
-    values = jax.lax.map(partial(_correlations, angles), _blocks(scaled))
+    values = jax.lax.map(lambda block: jax.lax.map(partial(_correlation, block), angles), _blocks(scaled))
     values = jnp.moveaxis(values, 1, 0).reshape(_ANGLES, -1)[:, : math.prod(size.shape)]
     return jnp.where(constant, 0.0, jnp.median(values.reshape(_ANGLES, *size.shape), axis=0))
 
@@ -53,11 +52,6 @@ def _blocks(series: Array) -> Array:
     flat = series.reshape(len(series), -1)
     flat = jnp.pad(flat, ((0, 0), (0, -flat.shape[1] % _BLOCK)))
     return jnp.moveaxis(flat.reshape(len(series), -1, _BLOCK), 1, 0)
-
-
-def _correlations(angles: Array, series: Array) -> Array:
-    """Correlation for every angle, shape ``(len(angles), ...)``."""
-    return jax.lax.map(lambda angle: _correlation(series, angle), angles)
 
 
 def largest_k01(section: Array) -> Array:
@@ -177,7 +171,6 @@ def _smooth(target: Array, turn: tuple[Array, Array]) -> Array:
 
 # The strobes after a run: the 0-1 test, and the close returns of a torus.
 
-
 # Strobes after the run, and the longest return in strobes that is searched.
 SAMPLES, LONGEST = 1024, 512
 # Distances of close returns, relative to the motion: a torus comes as close as the smaller ones, but later.
@@ -233,7 +226,6 @@ def returns(section: Array) -> Array:
 #
 # The paper does not print the length of an interval; here it is one strobe. An interval at whose end a component has
 # the distance 0 is left out, such as the first interval of a flow with a clock, which starts at 0.
-
 
 # Relative perturbation of every component.
 PERTURBATION = 1e-5

@@ -178,7 +178,6 @@ def _operations(jaxpr: Any) -> Iterator[str]:
 
 # Predictions from parameters before a computation, by functions in JAX.
 
-
 # Points per evaluation, for few points and for many.
 _FEW, _MANY = 32, 2048
 
@@ -202,7 +201,11 @@ def predicted(function: Callable[..., Array], constants: tuple[Hashable, ...], c
         size = min(together, count - start)
         # The last block is padded with its last point.
         places = np.minimum(np.arange(start, start + together), count - 1)
-        blocks.append(_called(call, taken(numbers, places))[..., :size])
+        try:
+            blocks.append(np.asarray(call(taken(numbers, places)))[..., :size])
+        except InputError as error:
+            # Drop the notes that jax adds to an exception.
+            raise InputError(*error.args) from None
     return np.concatenate(blocks, axis=-1)
 
 
@@ -225,14 +228,6 @@ def split(columns: Columns) -> tuple[Words, dict[str, Any]]:
     """The words and the numbers among the values."""
     numbers = {name: value for name, value in columns.items() if not isinstance(value, str)}
     return tuple((name, value) for name, value in columns.items() if name not in numbers), numbers
-
-
-def _called(call: Callable[[Columns], Array], block: Columns) -> np.ndarray:
-    try:
-        return np.asarray(call(block))
-    except InputError as error:
-        # Drop the notes that jax adds to an exception.
-        raise InputError(*error.args) from None
 
 
 @lru_cache(maxsize=32)

@@ -252,7 +252,6 @@ def bidiagonal_values(form: Bidiagonal) -> tuple[Array, Array]:
 # of a round are disjoint and rotate together. The vectors are products of rotations, hence orthonormal up to rounding,
 # even within clusters and for singular values of zero.
 
-
 _MAX_SWEEPS = 30
 
 
