@@ -20,19 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.measure import (
-    Columns,
-    Job,
-    Judged,
-    Method,
-    Study,
-    columns_scene,
-    engine_job,
-    judged,
-    near,
-    outcomes,
-    take,
-)
+from benchmarks.measure import Columns, Job, Judged, Method, Study, judged, near, outcomes, points_job, take
 from tests.oracles.bicardan_precise_reference import precise_frequencies
 from tests.oracles.bicardan_reference import determinant_roots, finite_elements
 from tests.oracles.bicardan_rivals import dynamic_stiffness_frequencies, hermite_frequencies
@@ -98,11 +86,10 @@ def error_of(region: str, setting: Any, result: Any) -> Judged:
 
 def package(columns: Columns, modes: int, method: str = "certified", threads: int = 1) -> Job:
     """A method of the package; all entries of the lists vary, so that one kernel serves all regions."""
-    scene = columns_scene(
-        "bicardan", "critical_speeds", ["angular_frequency"], columns,
-        fixed={name: [1.0] * 3 for name in _LISTS}, options={"method": method, "modes": modes},
-    )  # fmt: skip
-    return engine_job(scene, threads)
+    fixed, options = {name: [1.0] * 3 for name in _LISTS}, {"method": method, "modes": modes}
+    return points_job(
+        "bicardan", "critical_speeds", ["angular_frequency"], columns, threads, fixed=fixed, options=options
+    )
 
 
 def _package(method: str) -> Method:

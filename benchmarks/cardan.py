@@ -23,20 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from benchmarks.measure import (
-    Columns,
-    Job,
-    Judged,
-    Method,
-    Study,
-    columns_scene,
-    engine_job,
-    judged,
-    near,
-    once,
-    outcomes,
-    take,
-)
+from benchmarks.measure import Columns, Job, Judged, Method, Study, judged, near, once, outcomes, points_job, take
 from tests.oracles.cardan_orbit_reference import geometry, linear_field, nonlinear_field
 from tests.oracles.cardan_precise_reference import spectral_radius as precise_radius
 from tests.oracles.cardan_reference import (
@@ -175,8 +162,8 @@ def floquet(
     """The package's analysis ``floquet`` as ``prepare`` of a method."""
 
     def prepare(region: str, rtol: float) -> Job:
-        return engine_job(columns_scene("cardan", "floquet", RADIUS, columns_of(points[region], count),
-                                        options={"method": method, "rtol": rtol, **options}))  # fmt: skip
+        used = {"method": method, "rtol": rtol, **options}
+        return points_job("cardan", "floquet", RADIUS, columns_of(points[region], count), options=used)
 
     return prepare
 
@@ -401,7 +388,7 @@ def _state(region: str) -> str:
 def forced(region: str, rtol: float) -> Job:
     """The analysis ``forced``."""
     columns, state = columns_of(MOTIONS[region].point, SOME), _state(region)
-    return engine_job(columns_scene("cardan", "forced", [state, f"{state}_error"], columns, options={"rtol": rtol}))
+    return points_job("cardan", "forced", [state, f"{state}_error"], columns, options={"rtol": rtol})
 
 
 def forced_error(region: str, rtol: float, results: Mapping[str, np.ndarray]) -> Judged:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cardan import HEYOKA
-from benchmarks.measure import Job, Judged, Method, Study, columns_scene, engine_job, judged
+from benchmarks.measure import Job, Judged, Method, Study, judged, points_job
 from tests.oracles.cardan_reference import spectral_radius
 from tests.oracles.driveline_reference import multipliers
 
@@ -104,8 +104,8 @@ heyoka_chain = cache(HeyokaChain)
 
 def direct(region: str, rtol: float) -> Job:
     """The package."""
-    return engine_job(columns_scene("driveline", "floquet", _OUTPUTS, {"speed": SPEEDS}, fixed=CHAIN,
-                                    options={"method": "direct", "rtol": rtol}))  # fmt: skip
+    options = {"method": "direct", "rtol": rtol}
+    return points_job("driveline", "floquet", _OUTPUTS, {"speed": SPEEDS}, fixed=CHAIN, options=options)
 
 
 def heyoka(region: str, tolerance: float) -> Job:

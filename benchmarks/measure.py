@@ -330,6 +330,13 @@ def engine_job(scene: Mapping[str, Any], threads: int = 1, spent: np.ndarray | N
     return job
 
 
+def points_job(
+    system: str, analysis: str, outputs: Sequence[str], columns: Columns, threads: int = 1, **rest: Any
+) -> Job:
+    """:func:`engine_job` of listed points."""
+    return engine_job(columns_scene(system, analysis, outputs, columns, **rest), threads)
+
+
 def outcomes(outcome: np.ndarray) -> str:
     """The names of the outcomes other than success, by which the package reports failures."""
     from drivetrain_jax.analysis import Outcome

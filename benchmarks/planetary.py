@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import eigh
 
-from benchmarks.measure import GOAL, Job, Judged, Method, Study, columns_scene, engine_job, judged, near, outcomes, take
+from benchmarks.measure import GOAL, Job, Judged, Method, Study, judged, near, outcomes, points_job, take
 from tests.oracles.planetary_reference import (
     TABLE_2,
     exact_frequencies,
@@ -97,7 +97,7 @@ def package(method: str, region: str, setting: Any, outputs: Sequence[str] = _SP
     """A method of the package."""
     fixed = {"planet_angle": list(REGIONS[region]["planet_angle"])}
     columns = neighbours(region, _LANES)
-    return engine_job(columns_scene("planetary", "modes", outputs, columns, fixed=fixed, options={"method": method}))
+    return points_job("planetary", "modes", outputs, columns, fixed=fixed, options={"method": method})
 
 
 def _factors(region: str) -> np.ndarray:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from benchmarks.measure import Job, Judged, Method, Study, columns_scene, engine_job, judged, once, outcomes
+from benchmarks.measure import Job, Judged, Method, Study, engine_job, judged, once, outcomes, points_job
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
 from tests.oracles.rattle_reference import extended, field, scipy_events, scipy_plain
 
@@ -290,9 +290,7 @@ def response_error(largest: float, notice: str) -> Judged:
 def steady_state(region: str, rtol: float) -> Job:
     """The analysis ``steady_state``."""
     columns = arrays(LIMITS[region], _MEMBERS) | dict(zip(("u0", "v0"), starts_of(region, _MEMBERS).T, strict=True))
-    return engine_job(
-        columns_scene("rattle", "steady_state", ["orbit_state", "state_error"], columns, options={"rtol": rtol})
-    )
+    return points_job("rattle", "steady_state", ["orbit_state", "state_error"], columns, options={"rtol": rtol})
 
 
 def response(method: str, output: str, option: str, region: str, setting: Any) -> Job:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from benchmarks.measure import Job, Judged, Method, Study, columns_scene, engine_job, judged, once, outcomes
+from benchmarks.measure import Job, Judged, Method, Study, judged, once, outcomes, points_job
 from tests.oracles.tripod_reference import NINE_DEGREES, Shaft, shaft
 
 HEYOKA = find_spec("heyoka") is not None
@@ -179,9 +179,7 @@ def section(method: str, lanes: int, name: str, setting: Any) -> Job:
     accuracy = {"steps": setting} if method == "fixed" else {"rtol": setting, "atol": 1e-3 * setting}
     options = {"method": method, "strobes": _LEAST, "discard": _first(REGIONS[name]), **accuracy}
     columns = _columns(REGIONS[name], lanes)
-    return engine_job(
-        columns_scene("tripod", "poincare", ["section", "strobe_error"], columns, fixed=_FIXED, options=options)
-    )
+    return points_job("tripod", "poincare", ["section", "strobe_error"], columns, fixed=_FIXED, options=options)
 
 
 def _section_error(name: str, setting: Any, result: Any) -> Judged:
@@ -193,9 +191,7 @@ def history(name: str, rtol: float) -> Job:
     """The analysis ``history`` by diffrax on equal motions."""
     region, outputs = REGIONS[name], ["phi", "velocity", "phi_error", "velocity_error"]
     options = {"method": "diffrax", "rtol": rtol, "times": [region.strobes / region.parameters["excitation_frequency"]]}
-    return engine_job(
-        columns_scene("tripod", "history", outputs, _columns(region, _FEW), fixed=_FIXED, options=options)
-    )
+    return points_job("tripod", "history", outputs, _columns(region, _FEW), fixed=_FIXED, options=options)
 
 
 def _history_error(name: str, setting: Any, result: Any) -> Judged:
