@@ -211,7 +211,8 @@ def point_sensitivities(
     """Sensitivities of the results ``values`` of a point, by result, largest effect first: by the ``given`` names and by
     parameters that do not follow from them. ``physical`` are the data in their units; numbers of 0 have none."""
     system, names = scene.system, [v.name for v in differentiable(scene.analysis, scene.request.outputs)]
-    options = {**scene.request.options, "method": scene.request.method}
+    # An empty list is the default of an option, and no value of it.
+    options = {n: x for n, x in scene.request.options.items() if x != ()} | {"method": scene.request.method}
     keys, found = jacobians(scene.analysis.name, system.of(parameters), names, options, values, hold=True)
     known = described(system)
     pool = {name: {**parameters, **physical}[name] for name in given if name in known}
