@@ -134,15 +134,9 @@ class _AfterXarray:
         from importlib.util import find_spec
 
         sys.meta_path.remove(self)
-        spec = find_spec(name)
-        if spec is not None and spec.loader is not None:
-            execute = spec.loader.exec_module
-
-            def execute_and_register(module: Any) -> None:
-                execute(module)
-                _register_accessor()
-
-            spec.loader.exec_module = execute_and_register
+        if (spec := find_spec(name)) and (loader := spec.loader):
+            execute = loader.exec_module
+            loader.exec_module = lambda module: (execute(module), _register_accessor())[0]
         return spec
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import shutil
 import signal
 import sys
 import threading
@@ -120,6 +119,9 @@ class StatusLine:
                 self._shown = shell.display(shell.HTML(bar + text), display_id=True)
         elif terminal():
             bar = "" if part is None else f"[{'#' * round(20 * part):-<20}] "
+            # Local import: this package is imported in milliseconds.
+            import shutil
+
             line = (bar + text)[: shutil.get_terminal_size().columns - 1]
             print(f"\r{line}\x1b[K", end="", file=sys.stderr, flush=True)
             self._shown = text

@@ -22,19 +22,20 @@ def plugin_names(group: str) -> tuple[str, ...]:
 def load_plugin(group: str, name: str, wanted: str, is_wanted: Callable[[Any], bool] = callable) -> Any:
     """The object of the entry point ``name``; None without one.
 
-    Raises ``ImportError`` with one line if its package fails, or if the object is not of the kind ``wanted`` or has another
-    name.
+    Raises :class:`InputError` if its package fails, or if the object is not of the kind ``wanted`` or has another name.
     """
+    field = f"{'system' if group == SYSTEMS else 'analysis'} = {name!r}"
     for entry in entry_points(group=group, name=name):
         try:
             plugin = entry.load()
         # Code of another package may raise anything.
         except Exception as error:
-            raise ImportError(f"{entry.value} cannot be loaded: {type(error).__name__}: {error}") from error
+            text = " ".join(str(error).split())
+            raise InputError(f"{field}: {entry.value} cannot be loaded: {type(error).__name__}: {text}") from error
         if not is_wanted(plugin):
-            raise ImportError(f"{entry.value} is of type {type(plugin).__name__}, not {wanted}")
+            raise InputError(f"{field}: {entry.value} is of type {type(plugin).__name__}, not {wanted}")
         if getattr(plugin, "name", name) != name:
-            raise ImportError(f"{entry.value} is named {plugin.name}, not {name}")
+            raise InputError(f"{field}: {entry.value} is named {plugin.name}, not {name}")
         return plugin
     return None
 

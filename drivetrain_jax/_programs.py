@@ -32,11 +32,9 @@ from drivetrain_jax.systems import System
 
 # Most entries of JAX's cache and most programs; a program takes some 300 kB.
 _ENTRIES, _PROGRAMS = 1000, 256
-# Bytes of the digest in front of a program.
-_DIGEST = 16
 # Errors of a kernel that cannot be stored, or of a file that is missing, damaged or of no use here.
 _UNUSABLE = (OSError, ValueError, TypeError, KeyError, AttributeError, NotImplementedError, pickle.PickleError)
-_UNUSABLE += (jax.errors.JaxRuntimeError,)
+_UNUSABLE += (zlib.error, jax.errors.JaxRuntimeError)
 
 
 def enable(*, short: bool = False) -> None:
@@ -239,11 +237,10 @@ def _read(name: str) -> Any:
     folder = programs()
     if not name or folder is None:
         raise FileNotFoundError(name)
-    data = (folder / name).read_bytes()
-    if hashlib.blake2b(data[_DIGEST:], digest_size=_DIGEST).digest() != data[:_DIGEST]:
-        raise ValueError(f"{name}: damaged")
+    # The checksum of zlib finds damage.
+    data = zlib.decompress((folder / name).read_bytes())
     (folder / name).touch()
-    return pickle.loads(zlib.decompress(data[_DIGEST:]))
+    return pickle.loads(data)
 
 
 def _write(name: str, content: Any) -> None:
@@ -252,7 +249,5 @@ def _write(name: str, content: Any) -> None:
     if name and folder is not None:
         with suppress(OSError):
             folder.mkdir(mode=0o700, exist_ok=True)
-            data = zlib.compress(pickle.dumps(content), 1)
-            data = hashlib.blake2b(data, digest_size=_DIGEST).digest() + data
-            write_atomic(folder / name, data, folder / f"{name}.{os.getpid()}.tmp")
+            write_atomic(folder / name, zlib.compress(pickle.dumps(content), 1), folder / f"{name}.{os.getpid()}.tmp")
             _trim(folder, _PROGRAMS)

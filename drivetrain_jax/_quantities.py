@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import re
 import warnings
+from collections.abc import Iterator, KeysView
 from dataclasses import dataclass
 from decimal import Decimal
 from numbers import Real
-from typing import Any
+from typing import Any, ClassVar
 
 from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError, shown
@@ -153,6 +154,32 @@ class Parameter:
         if self.units != "rad" or not math.isfinite(value) or not self._is_within(math.radians(value)):
             return ""
         return f'; did you mean "{value:.10g} deg"?'
+
+
+class NamedResults:
+    """Results by attribute or by name. A subclass names its field that holds them."""
+
+    _field: ClassVar[str]
+
+    def __getattr__(self, name: str) -> Any:
+        # A copy asks before it has any attribute.
+        results = vars(self).get(self._field, {})
+        if name not in results:
+            raise AttributeError(f"no result {name!r}; there is {', '.join(results)}")
+        return results[name]
+
+    def __getitem__(self, name: str) -> Any:
+        return getattr(self, self._field)[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.keys())
+
+    def keys(self) -> KeysView[str]:
+        """Names of the results, so that ``dict(result)`` holds them."""
+        return getattr(self, self._field).keys()
+
+    def __dir__(self) -> list[str]:
+        return sorted({*super().__dir__(), *self.keys()})
 
 
 def count(name: str, long_name: str, **rest: Any) -> Parameter:

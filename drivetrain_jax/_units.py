@@ -79,10 +79,7 @@ def misread(text: str) -> str:
 
 
 def number(text: str, units: str) -> float:
-    """The number in ``units`` that ``text`` writes in a unit of its own.
-
-    Raises :class:`UnitError` for a text without number or unit, an unknown unit, and a unit of another dimension.
-    """
+    """The number in ``units`` that ``text`` writes in a unit of its own."""
     parts = split(text)
     if parts is None:
         raise UnitError("not a number with a unit")

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -24,19 +24,20 @@ from jax import Array
 from jax.custom_batching import custom_vmap
 
 from drivetrain_jax import _programs
-from drivetrain_jax._errors import InputError, did_you_mean
-from drivetrain_jax.analysis import OUTCOME, Analysis, Dimension, Outcome, Request, Solver, analyses_of, get_analysis
+from drivetrain_jax._errors import InputError
+from drivetrain_jax._quantities import NamedResults
+from drivetrain_jax.analysis import OUTCOME, Analysis, Dimension, Outcome, Request, Solver, analysis_of, get_analysis
 from drivetrain_jax.analysis._base import checked_solvers, dimensions_of, make_request
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
-from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lanes_last, path_entry
-from drivetrain_jax.systems import Model, System
+from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lanes_last, path_entry, with_lanes
+from drivetrain_jax.systems import System
 from drivetrain_jax.systems._base import printed
 
 # Lanes of similar effort that are solved together, and lanes whose program is compiled without optimisation.
 _TOGETHER, _FEW = 128, 128
 
 
-class Result(eqx.Module):
+class Result(NamedResults, eqx.Module):
     """The variables of one analysis and ``outcome``, by attribute or by name; a pytree of arrays.
 
     Units and meanings: ``drivetrain list SYSTEM``.
@@ -47,28 +48,11 @@ class Result(eqx.Module):
     (['natural_frequency', 'outcome'], (21,))
     """
 
+    _field: ClassVar[str] = "variables"
     variables: dict[str, Array]
-
-    def __getattr__(self, name: str) -> Array:
-        if name.startswith("_") or name == "variables" or name not in self.variables:
-            raise AttributeError(f"no result {name!r}; there is {', '.join(vars(self).get('variables', ()))}")
-        return self.variables[name]
 
     def __repr__(self) -> str:
         return f"Result({', '.join(f'{name}={printed(x)}' for name, x in self.variables.items())})"
-
-    def __getitem__(self, name: str) -> Array:
-        return self.variables[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.variables)
-
-    def keys(self) -> Any:
-        """Names of the variables, so that ``dict(result)`` holds them."""
-        return self.variables.keys()
-
-    def __dir__(self) -> list[str]:
-        return sorted({*super().__dir__(), *self.variables})
 
 
 @dataclass(frozen=True)
@@ -109,25 +93,20 @@ def analyse(name: str, system: System, outputs: Sequence[str] | None, options: M
     return Result({name: x[0] for name, x in values.items()} if job.single else values)
 
 
-def model_and_analysis(name: str, system: Any) -> tuple[Model, Analysis]:
-    """The model of ``system`` for the analysis ``name``, and this analysis for its class; ``InputError`` without one."""
+def checked_analysis(name: str, system: Any) -> Analysis:
+    """The analysis ``name`` for the class of ``system``; ``InputError`` for another object or without a model."""
     if not isinstance(system, System):
         kind = f"the class {system.__name__}" if isinstance(system, type) else f"a {type(system).__name__}"
         raise InputError(f"system: got {kind}; expected a system such as drivetrain_jax.Cardan(...)")
-    try:
-        # The model first: only a system with one declares what the analysis takes from its class.
-        return get_analysis(name).model(type(system)), get_analysis(name).for_system(type(system))
-    except KeyError:
-        known = analyses_of(type(system))
-        guess = did_you_mean(name, known)
-        raise InputError(f"{name}: unknown to {system.name}{guess}; expected one of {', '.join(known)}") from None
+    return analysis_of(type(system), name)
 
 
 def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapping[str, Any]) -> tuple[_Job, Any]:
     """The checked call, and its numbers as arrays."""
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise InputError("jax_enable_x64 = False: expected True, by jax.config.update or within jax.enable_x64(True)")
-    model, analysis = model_and_analysis(name, system)
+    analysis = checked_analysis(name, system)
+    model = analysis.model(type(system))
     values = {key: value for key, value in system.values.items() if key in model.parameters}
     try:
         request = make_request(type(system), analysis, [outputs] if isinstance(outputs, str) else outputs, options)
@@ -334,7 +313,7 @@ def _solve(job: _Job, index: int, parameters: Any, effort: Array | None = None) 
 
         def solve(values: Any, effort: Array, count: int) -> dict[str, Array]:
             solved = solver.solve(eqx.combine(values, constants.tree), effort)
-            return {name: _with_lanes(x, job.own_dims(name), count) for name, x in solved.items()}
+            return {name: with_lanes(x, job.own_dims(name), count) for name, x in solved.items()}
 
         if predict is None:
             return solve(parameters, effort, lanes)
@@ -353,13 +332,6 @@ def _solve(job: _Job, index: int, parameters: Any, effort: Array | None = None) 
     if not jax.tree.leaves(parameters):
         return {name: x[..., 0] for name, x in of_lanes(job.constants, parameters, jnp.int64(1)).items()}
     return lanes_last(of_lanes, job.constants, parameters, jnp.int64(1) if effort is None else effort)
-
-
-def _with_lanes(result: Array, dims: int, lanes: int) -> Array:
-    """``result`` with the lanes as last axis, also if it does not depend on the varying parameters."""
-    result = jnp.asarray(result)
-    result = result if result.ndim > dims else result[..., None]
-    return jnp.broadcast_to(result, (*result.shape[:-1], lanes))
 
 
 @dataclass(frozen=True)

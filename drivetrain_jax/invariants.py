@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from drivetrain_jax._errors import InputError
 from drivetrain_jax._plugins import RULES, call_plugin, load_plugin
 from drivetrain_jax._quantities import FIRST_FAILURE
 from drivetrain_jax._rules import BUILT_IN, Declared, Rule, in_order, multiple, ordered, relation, sums_to_one, within
@@ -140,28 +139,22 @@ def declared(analysis: str) -> Declared:
     """The declaration of the analysis with this name."""
     if analysis in BUILT_IN:
         return BUILT_IN[analysis]
-    try:
-        rules = load_plugin(RULES, analysis, "the rules of an analysis", lambda x: isinstance(x, Declared))
-    except ImportError as error:
-        raise InputError(f"analysis = {analysis!r}: {' '.join(str(error).split())}") from error
+    rules = load_plugin(RULES, analysis, "the rules of an analysis", lambda x: isinstance(x, Declared))
     if rules is None:
         return Declared()
-    return replace(rules, rules=tuple(_of_plugin(rule, analysis) for rule in rules.rules))
+    broken = {"kind": xr.DataArray, "allowed": "a DataArray of booleans"}
 
+    def named(rule: Rule) -> Rule:
+        """``rule`` with errors that name the entry point."""
+        called = partial(call_plugin, RULES, analysis, f"rule {rule.text!r} of", rule.broken, **broken)
+        return replace(rule, broken=called)
 
-def _of_plugin(rule: Rule, analysis: str) -> Rule:
-    """``rule`` with errors that name the entry point of ``analysis``."""
-    what, allowed = f"rule {rule.text!r} of", "a DataArray of booleans"
-    broken = partial(call_plugin, RULES, analysis, what, rule.broken, kind=xr.DataArray, allowed=allowed)
-    return replace(rule, broken=broken)
+    return replace(rules, rules=tuple(map(named, rules.rules)))
 
 
 @dataclass(frozen=True, repr=False)
 class Report:
-    """The ``lines`` of a report; ``problem`` is the first problem, empty without one.
-
-    ``complete`` is false for unfinished work.
-    """
+    """The ``lines`` of a report; ``problem`` is the first problem, empty without one."""
 
     lines: tuple[str, ...]
     problem: str = ""
@@ -186,68 +179,43 @@ def verify(path: Path) -> Report:
     """
     parts = PartsFolder(path)
     if not path.exists() and parts.holds_work():
-        return _verify_parts(parts)
+        # Damaged blocks are no error, because a resumed run computes them again.
+        store, read = parts.path / zarr_store.UNFINISHED, parts.read
+        present = parts.numbers()
+        if store.is_dir():
+            present = np.flatnonzero(zarr_store.done(store)).tolist()
+            read = partial(zarr_store.read, store, zarr_store.shards_of(store))
+        intact = sum(read(number) is not None for number in present)
+        lines = [f"unfinished: {intact} of {len(present)} blocks are intact"]
+        lines += ["the run that resumes computes the others again"] if intact < len(present) else []
+        return Report(tuple(lines), complete=False)
     if zarr_store.is_store(path):
-        return _verify_store(path)
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "not a regular file" if path.exists() else "does not exist"
-        raise InputError(f"file = {str(path)!r}: {what}; give a result written by `drivetrain run`")
-    return _verify_file(path)
-
-
-def _verify_file(path: Path) -> Report:
+        if not zarr_store.is_sealed(path):
+            what = "attributes of the store"
+            return Report((f"checksums: {what} differ",), f"{what}: damaged; restore them or compute the store again")
+        intact = list(zarr_store.intact(path))
+        wrong, count = intact.count(False), len(intact)
+        problem = f"{wrong} of {count} shards are damaged; compute them again" if wrong else ""
+        rules = "rules: applied to the file that `drivetrain export` makes of the store"
+        return Report((f"checksums: {wrong or 'none'} of {count} shards differ", rules), problem)
     damaged = checksums.damaged(path)
-    if damaged:
-        names = checksums.named(damaged)
-        problem = f"{names}: damaged; restore the file or compute it again"
-        return Report((f"checksums: {len(damaged)} differ: {names}",), problem)
     if damaged is None and "digest" in attributes(path):
-        problem = "its checksums are gone; restore the file or compute it again"
-        return Report(("checksums: gone",), problem)
-    sealed = "none in this file" if damaged is None else "all agree"
-    findings = check(open_result(path))
-    lines = (f"checksums: {sealed}", *map(str, findings))
-    return Report(lines, _first_broken(findings))
+        return Report(("checksums: gone",), "its checksums are gone; restore the file or compute it again")
+    agreed = "none in this file" if damaged is None else "all agree"
+    return _report(damaged, [] if damaged else check(open_result(path)), agreed)
 
 
 def verify_dataset(dataset: xr.Dataset, file: Path | None) -> Report:
     """The report on the numbers of ``dataset`` and on the checksums of ``file``, from which it was opened."""
-    findings = check(dataset)
-    changed = checksums.damaged(file) if file else None
-    if changed:
-        remedy = "restore the file or compute it again"
-        problem = f"file = {str(file)!r}: {checksums.named(changed)}: damaged; {remedy}"
-        return Report((f"checksums: {len(changed)} differ: {checksums.named(changed)}", *map(str, findings)), problem)
-    sealed = "not of a file" if changed is None else f"all agree in {file}"
-    return Report((f"checksums: {sealed}", *map(str, findings)), _first_broken(findings))
+    damaged = checksums.damaged(file) if file else None
+    agreed = "not of a file" if damaged is None else f"all agree in {file}"
+    return _report(damaged, check(dataset), agreed, f"file = {str(file)!r}: ")
 
 
-def _first_broken(findings: list[Finding]) -> str:
-    return next((f"{finding}; expected none" for finding in findings if finding.broken), "")
-
-
-def _verify_store(path: Path) -> Report:
-    if not zarr_store.is_sealed(path):
-        what = "attributes of the store"
-        problem = f"{what}: damaged; restore them or compute the store again"
-        return Report((f"checksums: {what} differ",), problem)
-    intact = list(zarr_store.intact(path))
-    wrong, count = intact.count(False), len(intact)
-    problem = f"{wrong} of {count} shards are damaged; compute them again" if wrong else ""
-    rules = "rules: applied to the file that `drivetrain export` makes of the store"
-    return Report((f"checksums: {wrong or 'none'} of {count} shards differ", rules), problem)
-
-
-def _verify_parts(parts: PartsFolder) -> Report:
-    """The report on stored blocks; damaged ones are no error, because a resumed run computes them again."""
-    store = parts.path / zarr_store.UNFINISHED
-    if store.is_dir():
-        present, shards = np.flatnonzero(zarr_store.done(store)).tolist(), zarr_store.shards_of(store)
-        intact = sum(zarr_store.read(store, shards, number) is not None for number in present)
-    else:
-        present = parts.numbers()
-        intact = sum(parts.read(number) is not None for number in present)
-    lines = [f"unfinished: {intact} of {len(present)} blocks are intact"]
-    if intact < len(present):
-        lines.append("the run that resumes computes the others again")
-    return Report(tuple(lines), complete=False)
+def _report(damaged: list[str] | None, findings: list[Finding], agreed: str, before: str = "") -> Report:
+    line, problem = f"checksums: {agreed}", next((f"{f}; expected none" for f in findings if f.broken), "")
+    if damaged:
+        names = checksums.named(damaged)
+        line = f"checksums: {len(damaged)} differ: {names}"
+        problem = f"{before}{names}: damaged; restore the file or compute it again"
+    return Report((line, *map(str, findings)), problem)

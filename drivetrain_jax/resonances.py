@@ -292,10 +292,7 @@ def stored_orders(attrs: Mapping[str, Any]) -> Orders | None:
 
 
 def operating_range(options: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Lowest and highest operating speed [rpm] of the options of an analysis; None if they are not given.
-
-    Raises :class:`InputError` for a range that does not rise.
-    """
+    """Lowest and highest operating speed [rpm] of the options of an analysis; None if they are not given."""
     low, high = (options.get(f"operating_{end}", 0.0) for end in ("min", "max"))
     if high < low:
         raise InputError(f"options.operating_max = {high:g}: expected a speed of at least operating_min = {low:g}")

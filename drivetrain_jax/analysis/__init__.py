@@ -9,7 +9,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from drivetrain_jax._errors import nearest
+from drivetrain_jax._errors import InputError, did_you_mean, nearest
 from drivetrain_jax._plugins import ANALYSES, load_plugin, plugin_names
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 
@@ -39,7 +39,7 @@ _BUILT_IN = {
 
 __all__ = [
     "OUTCOME", "RTOL", "Analysis", "Dimension", "Outcome", "Parameter", "Request", "Solver", "Variable", "analyses_of",
-    "analysis_names", "forward_derivatives", "get_analysis", "over_lanes",
+    "analysis_names", "analysis_of", "forward_derivatives", "get_analysis", "over_lanes",
 ]  # fmt: skip
 
 
@@ -56,7 +56,7 @@ def analysis_names() -> tuple[str, ...]:
 
 
 def get_analysis(name: str) -> Analysis:
-    """The analysis ``name``; ``KeyError`` with the known names if there is none, ``ImportError`` if its package fails."""
+    """The analysis ``name``; ``KeyError`` if there is none, :class:`InputError` if its package fails."""
     if name in _BUILT_IN:
         module, _, record = _BUILT_IN[name].partition(":")
         return getattr(import_module(f"{__name__}.{module}"), record)
@@ -64,10 +64,27 @@ def get_analysis(name: str) -> Analysis:
 
     analysis = load_plugin(ANALYSES, name, "an analysis", lambda x: isinstance(x, Analysis))
     if analysis is None:
-        raise KeyError(f"analysis = {name!r}: expected one of {', '.join(analysis_names())}")
+        raise KeyError(name)
     if analysis.uses and analysis.uses not in analysis_names():
-        raise ImportError(f"uses = {analysis.uses!r}: no analysis{nearest(analysis.uses, analysis_names())}")
+        raise InputError(
+            f"analysis = {name!r}: uses = {analysis.uses!r}: no analysis{nearest(analysis.uses, analysis_names())}"
+        )
     return analysis
+
+
+def analysis_of(system: type[System], name: str) -> Analysis:
+    """The analysis ``name`` of ``system``, with what it declares; :class:`InputError` if it has no model for it."""
+    try:
+        analysis = get_analysis(name)
+        # The model first: only a system with one declares what the analysis takes from its class.
+        analysis.model(system)
+    except KeyError:
+        known = analyses_of(system)
+        guess = did_you_mean(str(name), known)
+        raise InputError(
+            f"analysis = {name!r}: unknown to {system.name}{guess}; expected one of {', '.join(known)}"
+        ) from None
+    return analysis.for_system(system)
 
 
 def analyses_of(system: type[System]) -> tuple[str, ...]:
@@ -76,7 +93,7 @@ def analyses_of(system: type[System]) -> tuple[str, ...]:
     for name in plugin_names(ANALYSES):
         try:
             uses = get_analysis(name).uses
-        except ImportError:
+        except InputError:
             # Skip a package that fails to import; `broken_analyses` reports its error.
             continue
         served |= dict.fromkeys([name] if uses in system.models else [])
@@ -89,6 +106,6 @@ def broken_analyses() -> dict[str, str]:
     for name in plugin_names(ANALYSES):
         try:
             get_analysis(name)
-        except ImportError as error:
-            reasons[name] = " ".join(str(error).split())
+        except InputError as error:
+            reasons[name] = str(error).partition(": ")[2]
     return reasons

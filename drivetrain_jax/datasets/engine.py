@@ -90,7 +90,7 @@ class AtlasEntrypoint(BackendEntrypoint):
 
 def _on_grid(path: str, grid: Any, solve: bool) -> xr.Dataset:
     from drivetrain_jax.analysis import OUTCOME
-    from drivetrain_jax.runs.assemble import to_dataset
+    from drivetrain_jax.runs.assemble import labelled
     from drivetrain_jax.runs.atlas_file import PROVED
 
     whole = _opened(path, _stamp(path))
@@ -102,7 +102,7 @@ def _on_grid(path: str, grid: Any, solve: bool) -> xr.Dataset:
     shape = tuple(len(values) for values in axes.values())
     # Broadcast numbers take no memory.
     blank = {name: np.broadcast_to(value, (*shape, *value.shape)) for name, value in point.items()}
-    dataset = to_dataset(replace(atlas, views=whole.views).scene_on(axes), blank, {})
+    dataset = labelled(replace(atlas, views=whole.views).scene_on(axes), blank, {}).to_dataset()
     degrees = np.max([(0,) * len(axes), *(panel.degrees for panel in atlas.stability.atlas.panels)], axis=0)
     chunks = _chunks(axes, dict(zip(atlas.parameters, degrees.tolist(), strict=True)))
     for name, value in point.items():
@@ -145,14 +145,12 @@ def _chunks(axes: dict[str, Any], degrees: dict[str, int]) -> list[int]:
 
 
 def _in_atlas_parameters(atlas: StoredAtlas, grid: Any) -> tuple[Any, StoredAtlas]:
-    """``grid`` with parameters of the atlas for physical data and texts, and the atlas that shows these data.
-
-    Raises :class:`InputError` for physical data that do not determine a parameter.
-    """
+    """``grid`` with parameters of the atlas for physical data and texts, and the atlas that shows these data."""
     names = atlas.scene.system.physical.names if atlas.scene.system.physical else ()
     if not isinstance(grid, Mapping):
         return grid, atlas
-    if not any(name in names or _is_written(value) for name, value in grid.items()):
+    ends = [end for value in grid.values() for end in (value if isinstance(value, (tuple, list)) else (value,))]
+    if not {*grid} & {*names} and not any(isinstance(end, str) and _units.split(end) for end in ends):
         return grid, atlas.viewed({}, grid)
     counts = {name: value for name, value in grid.items() if _is_count(value)}
     rows = {name: value[:2] if _is_range(value) else value for name, value in grid.items() if name not in counts}
@@ -165,11 +163,6 @@ def _in_atlas_parameters(atlas: StoredAtlas, grid: Any) -> tuple[Any, StoredAtla
         elif parameter in values and _is_range(value):
             values[parameter] = (*values[parameter], value[2])
     return values, atlas
-
-
-def _is_written(entry: Any) -> bool:
-    ends = entry if isinstance(entry, (tuple, list)) else (entry,)
-    return any(isinstance(end, str) and _units.split(end) for end in ends)
 
 
 def _is_count(entry: Any) -> bool:

@@ -7,6 +7,7 @@ import io
 import json
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ import xarray as xr
 from drivetrain_jax import view
 from drivetrain_jax._errors import InputError, shown
 from drivetrain_jax._rules import BUILT_IN as declared
-from drivetrain_jax.resonances import BUILT_IN, Resonances
+from drivetrain_jax.resonances import BUILT_IN
 from drivetrain_jax.view.style import check_measured, in_units, is_joined, listed, parameters, scene_key, size
 
 if TYPE_CHECKING:
@@ -119,7 +120,13 @@ def drawn(datasets: list[xr.Dataset], asked: list[str], check: bool = True) -> F
 
     ``check`` raises :class:`InputError` for a unit that measures nothing in the first dataset.
     """
-    datasets = [_with_resonances(in_physical_data(dataset, asked)) for dataset in datasets]
+    datasets = [in_physical_data(dataset, asked) for dataset in datasets]
+    for k, dataset in enumerate(datasets):
+        analysis = declared.get(str(dataset.attrs.get("analysis")))
+        # Older files contain their predicted resonances.
+        if analysis and analysis.predicted and LABELS not in dataset.coords:
+            predicted = resonances(dataset)
+            datasets[k] = dataset if predicted is None else dataset.assign_coords({predicted.name: predicted})
     if check:
         check_measured(datasets[0], asked)
     return view.plot(*(in_units(dataset, asked) for dataset in datasets))
@@ -128,25 +135,21 @@ def drawn(datasets: list[xr.Dataset], asked: list[str], check: bool = True) -> F
 def _dataset(source: Any) -> xr.Dataset:
     if isinstance(source, xr.Dataset):
         return source
-    if isinstance(source, (str, Path)):
-        return _opened(Path(source))
-    raise InputError(
-        f"result: got a {type(source).__name__}; expected a Dataset, the path of a result, or a list of them"
-    )
-
-
-def _opened(path: Path) -> xr.Dataset:
+    if not isinstance(source, (str, Path)):
+        kind = type(source).__name__
+        raise InputError(f"result: got a {kind}; expected a Dataset, the path of a result, or a list of them")
     from drivetrain_jax.store.checksums import refuse_damaged
     from drivetrain_jax.store.consolidate import open_result
     from drivetrain_jax.store.parts import PartsFolder
 
-    if path.exists() or not PartsFolder(path).holds_work():
-        refuse_damaged(path)
-        return open_result(path)
-    # Local import: the module imports jax, which a complete result does not need.
-    from drivetrain_jax.runs import output
+    path = Path(source)
+    if not path.exists() and PartsFolder(path).holds_work():
+        # Local import: the module imports jax, which a complete result does not need.
+        from drivetrain_jax.runs import output
 
-    return output.open_result(path)
+        return output.open_result(path)
+    refuse_damaged(path)
+    return open_result(path)
 
 
 def _chart(source: Result, part: Mapping[str, Any] | None, cells: int | None) -> xr.Dataset:
@@ -170,10 +173,10 @@ def in_physical_data(dataset: xr.Dataset, asked: Sequence[str]) -> xr.Dataset:
         return dataset
     # Local import: the modules import jax, which figures in the units of the file do not need.
     from drivetrain_jax.runs.atlas_chart import in_physical_units
-    from drivetrain_jax.runs.scene import find_system
+    from drivetrain_jax.systems import get_system
 
     try:
-        physical = find_system(str(dataset.attrs.get("system"))).physical
+        physical = get_system(str(dataset.attrs.get("system"))).physical
     except InputError:
         return dataset
     known = {n: e["value"] for n, e in json.loads(dataset.attrs.get("fixed_parameters", "{}")).items()} | data
@@ -184,15 +187,6 @@ def in_physical_data(dataset: xr.Dataset, asked: Sequence[str]) -> xr.Dataset:
         # Predictions along the parameter are computed again along the quantity.
         dataset = in_physical_units(dataset.drop_vars([LABELS, f"{LABELS}_{name}"], errors="ignore"), name, *quantity)
     return dataset
-
-
-def _with_resonances(dataset: xr.Dataset) -> xr.Dataset:
-    """``dataset`` with the predicted resonances of its system, which older files already contain."""
-    analysis = declared.get(str(dataset.attrs.get("analysis")))
-    if analysis is None or not analysis.predicted or LABELS in dataset.coords:
-        return dataset
-    predicted = resonances(dataset)
-    return dataset if predicted is None else dataset.assign_coords({predicted.name: predicted})
 
 
 def _loaded(dataset: xr.Dataset) -> xr.Dataset:
@@ -216,7 +210,14 @@ def resonances(dataset: xr.Dataset) -> xr.DataArray | None:
 
     Returns: ``resonance_AXIS``; its dimensions are the axes that the predictions depend on, then ``resonance`` (labels).
     """
-    predicted = _predicted(str(dataset.attrs.get("system")))
+    predicted = BUILT_IN.get(system := str(dataset.attrs.get("system")))
+    if system not in BUILT_IN:
+        # Local import: the module imports jax.
+        from drivetrain_jax.systems import get_system
+
+        # The package of the system may not be installed, or the dataset may be a sweep of a function.
+        with suppress(InputError):
+            predicted = get_system(system).resonances
     if predicted is None or is_joined(dataset):
         return None
     needed, axis = set(predicted.parameters), predicted.axis
@@ -242,16 +243,3 @@ def resonances(dataset: xr.Dataset) -> xr.DataArray | None:
     coords[LABELS] = xr.Variable(LABELS, list(predicted.labels), {"long_name": "resonance"})
     about = {"units": quantity.attrs["units"], "long_name": predicted.long_name}
     return xr.DataArray(values, coords, [*coords], f"{LABELS}_{quantity.name}", about)
-
-
-def _predicted(system: str) -> Resonances | None:
-    if system in BUILT_IN:
-        return BUILT_IN[system]
-    # Local import: the module imports jax.
-    from drivetrain_jax.runs.scene import find_system
-
-    try:
-        return find_system(system).resonances
-    except InputError:
-        # The package of the system is not installed, or the dataset is a sweep of a function.
-        return None

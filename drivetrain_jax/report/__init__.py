@@ -100,16 +100,16 @@ def _section(path: Path, number: int, asked: list[str], amplitude: Any) -> dict[
         chart, compared = dataset.load(), False
         if analysis == "floquet" and charts.sweep_axes(chart) == [charts.role(chart, "speed")]:
             from drivetrain_jax.runs.reply import with_unstable_ranges
-            from drivetrain_jax.runs.scene import find_system
+            from drivetrain_jax.systems import get_system
 
             # Other systems have atlases for that.
-            atlas = "atlas" in find_system(str(attrs.get("system"))).models
+            atlas = "atlas" in get_system(str(attrs.get("system"))).models
             chart = chart if atlas or "verdict" not in chart else with_unstable_ranges(chart)[0]
     if amplitude is not None and (analysis == "floquet" or amplitudes(chart)):
         from drivetrain_jax.runs.reply import Limit
-        from drivetrain_jax.runs.scene import find_system
+        from drivetrain_jax.systems import get_system
 
-        system = find_system(str(attrs.get("system")))
+        system = get_system(str(attrs.get("system")))
         if "forced" in system.models and system.displacements is not None:
             limit, compared = Limit.from_text(system, amplitude), True
             moved = with_prefixes(convert(_forced_motion(chart))) if analysis == "floquet" else None

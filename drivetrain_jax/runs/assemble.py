@@ -17,7 +17,6 @@ import drivetrain_jax
 from drivetrain_jax._errors import ChunkError, InputError, RetryableError
 from drivetrain_jax._machine import machine
 from drivetrain_jax._programs import PACKAGES
-from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.scene import Problem, Scene, restore_scene, result_variables
@@ -28,8 +27,6 @@ from drivetrain_jax.store.parts import Arrays, PartsFolder
 from drivetrain_jax.systems import PhysicalData
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from drivetrain_jax.runs.job import Block, Job
 
 # Code of points that are not computed yet, which no finished result contains.
@@ -92,17 +89,6 @@ def sweep_first(array: np.ndarray, grid: Grid) -> np.ndarray:
     return array if position is None else np.moveaxis(array, position, len(grid.shape))
 
 
-def misfits(layout: Mapping[str, tuple[Any, tuple[int, ...]]], scene: Scene) -> list[str]:
-    """Names of the results whose type or shape in a file (``layout``) is not that of ``scene``; none for an atlas."""
-    shape = Grid.of(scene).result_shape
-
-    def fits(variable: Variable) -> bool:
-        kind, sizes = layout.get(variable.name, ("", ()))
-        return kind == variable.dtype and sizes[: len(shape)] == shape and len(sizes) == len(shape) + len(variable.dims)
-
-    return [v.name for v in (() if scene.analysis.continuous else result_variables(scene)) if not fits(v)]
-
-
 def blank(scene: Problem, grid: Grid, like: Arrays | None = None) -> Arrays:
     """Results of which none is computed, as arrays that take no memory.
 
@@ -152,11 +138,6 @@ def with_pending(result: Labelled) -> Labelled:
     codes = np.arange(PENDING + 1, dtype=OUTCOME.dtype)
     entry = replace(outcome, attrs={**outcome.attrs, "flag_values": codes, "flag_meanings": meanings})
     return replace(result, data={**result.data, OUTCOME.name: entry})
-
-
-def to_dataset(scene: Scene, arrays: Arrays, attrs: Mapping[str, str | float]) -> xr.Dataset:
-    """The labelled result as a Dataset."""
-    return labelled(scene, arrays, attrs).to_dataset()
 
 
 def _finite(value: Any) -> Any:
@@ -213,19 +194,12 @@ def result_attrs(scene: Scene) -> dict[str, str]:
 def stored_blocks(
     store: BlockStore, job: Job, points: np.ndarray | None = None, first: int = 0, without: Container[int] = ()
 ) -> Iterator[tuple[Block, Arrays]]:
-    """Yield the intact blocks of ``job``, or of some of its ``points``, ``without`` these numbers.
-
-    Numbers in the store start at ``first``. A block that does not fit the job counts as damaged.
-    """
-    numbers, variables = set(store.numbers()), result_variables(job.problem)
-    kinds = {v.name: (v.dtype, 1 + (job.grid.path is not None) + len(v.dims)) for v in variables}
+    """Yield the intact blocks of ``job``, or of some of its ``points``, ``without`` these; numbers in the store start at
+    ``first``."""
+    numbers = set(store.numbers())
     for block in job.blocks(points) if numbers else ():
-        if first + block.number not in numbers or block.number in without:
-            continue
-        results, count = store.read(first + block.number) or {}, len(job.points(block))
-        if {n: (str(x.dtype), x.ndim) for n, x in results.items()} == kinds and {len(x) for x in results.values()} == {
-            count
-        }:
+        number = first + block.number
+        if number in numbers and block.number not in without and (results := store.read(number)) is not None:
             yield block, results
 
 

@@ -254,7 +254,7 @@ def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None)
     if VERDICTS[int(results.get("verdict", -1))] != "undecided":
         rows.append(f"  {'proof':<24} the verdict {'is proved' if proved else 'holds by estimate, not by proof'}")
     slopes = radius_gradient(atlas.scene.system, {**atlas.fixed, **point})
-    effects = None if slopes is None else radius_sensitivities(asked, slopes)
+    effects = radius_sensitivities(asked, slopes)
     panels, system = atlas.stability.atlas, atlas.scene.system
     nearest = design.nearest_boundaries(panels, system, point) if has_boundaries(panels, system) else ()
     grows = growth_at(asked, results)

@@ -25,9 +25,8 @@ from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.tips import Tips, find_tips
 from drivetrain_jax.atlas.windows import narrow, stability_along
 from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, check_same, open_atlas
-from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.store.files import source_digest
-from drivetrain_jax.systems import System
+from drivetrain_jax.systems import System, get_system
 
 Convert = Callable[[Any], Any]
 # Values of each parameter that is not an axis of the chart.
@@ -165,7 +164,7 @@ def _stored_curves(
 ) -> dict[str, Any]:
     """The curves of a chart, traced once for this atlas, part and code, and then kept in the user's cache."""
     system, floquet = atlas.scene.system, atlas.scene_on({}).analysis
-    known = find_system(system.name) is system
+    known = get_system(system.name) is system
     panels = atlas.stability.atlas
     content = {
         # Words as such: an array of objects has no content of its own.

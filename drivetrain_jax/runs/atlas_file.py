@@ -23,7 +23,7 @@ from drivetrain_jax.analysis.atlas import ANALYSIS
 from drivetrain_jax.atlas import StabilityAtlas, from_arrays, proof, stability_atlas, to_arrays
 from drivetrain_jax.atlas.balls import contradictions
 from drivetrain_jax.atlas.floquet import floquet_domain, smoothness
-from drivetrain_jax.runs.assemble import ResultBuffer, labelled, result_attrs, to_dataset
+from drivetrain_jax.runs.assemble import ResultBuffer, labelled, result_attrs
 from drivetrain_jax.runs.axes import Axis, in_unit
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.physical import GivenData, in_parameters
@@ -326,7 +326,7 @@ class StoredAtlas:
         whole = columns[self.parameters[0]]
         shape, dims = whole.shape, whole.dims
         flat = {name: np.asarray(column.values, float).reshape(-1) for name, column in columns.items()}
-        dataset = to_dataset(self.scene_on(flat, zipped=True), self.arrays(flat, zipped=True), {})
+        dataset = labelled(self.scene_on(flat, zipped=True), self.arrays(flat, zipped=True), {}).to_dataset()
         inner = {name: v.dims[1:] for name, v in dataset.data_vars.items()}
         data = {
             name: ((*dims, *inner[name]), v.values.reshape((*shape, *v.shape[1:])), v.attrs)
@@ -361,7 +361,7 @@ class StoredAtlas:
             return self(proved=proved, **given)
         fixed = {name: float(column) for name, column in columns.items() if not column.ndim}
         part = self.slice(fixed)
-        dataset = to_dataset(part.scene_on(axes), part.arrays(axes), {})
+        dataset = labelled(part.scene_on(axes), part.arrays(axes), {}).to_dataset()
         if proved and "verdict" in dataset:
             flags = self.proved(_meshed(axes, fixed), np.asarray(dataset["verdict"].values))
             dataset["proved"] = (dataset["verdict"].dims, flags, PROVED)
@@ -451,7 +451,7 @@ class StoredAtlas:
         scene = self._scene(axes, dict(self.fixed), request, zipped=True)
         job = Job(replace(scene, analysis=get_analysis(analysis).for_system(scene.system)), DIRECT)
         buffer = ResultBuffer(job.scene, job.grid)
-        Work(Threads()).do(job, buffer, Progress(job.total))
+        Work(Threads()).do(job, buffer.fill, Progress(job.total))
         return buffer.lay_out()[request.outputs[0]]
 
     def in_parameters(self, values: Mapping[str, Any]) -> dict[str, Any]:

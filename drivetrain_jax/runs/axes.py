@@ -13,7 +13,8 @@ import msgspec
 import numpy as np
 
 from drivetrain_jax import _units
-from drivetrain_jax._errors import InputError, shown
+from drivetrain_jax._errors import InputError, clipped, shown
+from drivetrain_jax._machine import physical_memory
 from drivetrain_jax._quantities import Parameter
 from drivetrain_jax.analysis._base import checked
 from drivetrain_jax.runs import toml
@@ -25,6 +26,8 @@ MAX_POINTS = 2_000_000_000
 # Largest number of parameters of an atlas.
 MAX_RANGES = 4
 _SCALES = ("lin", "log")
+# Bytes per value of an axis while it is created and checked.
+_BYTES = 32
 
 
 class AxisTable(msgspec.Struct, forbid_unknown_fields=True):
@@ -119,11 +122,8 @@ def entry_of(name: str) -> tuple[str, int | None]:
     return (match.group(1), int(match.group(2))) if match else (name, None)
 
 
-def check_count(field: str, table: AxisTable, continuous: bool) -> int:
-    """Number of values of an axis, before they are computed; raises for incomplete or contradictory keys.
-
-    A ``continuous`` axis has two values, its ends.
-    """
+def axis_values(table: AxisTable, field: str, continuous: bool = False) -> np.ndarray:
+    """The values of an axis, its two ends if it is ``continuous``."""
     keys = [key for key in table.__struct_fields__ if getattr(table, key) is not None]
     if continuous and (extra := [key for key in keys if key not in ("start", "stop")]):
         value = getattr(table, extra[0])
@@ -134,43 +134,41 @@ def check_count(field: str, table: AxisTable, continuous: bool) -> int:
             raise InputError(f"{field}: values given together with {', '.join(keys[:-1])}; {allowed}")
         if not table.values:
             raise InputError(f"{field}.values = []: empty axis; expected one value or more")
-        return len(table.values)
-    if missing := [key for key in ("start", "stop") if key not in keys]:
-        allowed = "start and stop" if continuous else "start, stop and num, or values"
-        raise InputError(f"{field}.{missing[0]}: missing; expected {allowed}")
-    start, stop, num = cast(float, table.start), cast(float, table.stop), table.num
-    if continuous:
-        if not start < stop:
-            raise InputError(f"{field}.stop = {stop!r}: expected stop > start = {start!r}")
-        return 2
-    if num is None:
-        raise InputError(f"{field}.num: missing; expected num >= 1 (a range without num: analysis = 'atlas')")
-    if num < 1:
-        raise InputError(f"{field}.num = {num}: empty axis; expected num >= 1")
-    if num == 1 and start != stop:
-        ends = f"start = {start!r} and stop = {stop!r}"
-        raise InputError(f"{field}.num = 1: {ends} are two values; expected num >= 2, or values = [{start!r}]")
-    if table.scale not in (None, *_SCALES):
-        raise InputError(f"{field}.scale = {table.scale!r}: expected one of {', '.join(_SCALES)}")
-    if table.scale == "log" and not (start > 0 and stop > 0):
-        key, value = ("stop", stop) if start > 0 else ("start", start)
-        raise InputError(f"{field}.{key} = {value}: expected {key} > 0 on a log axis")
-    return num
-
-
-def spread(table: AxisTable, field: str) -> np.ndarray:
-    """The values of a checked axis; raises if a value occurs twice."""
-    if table.values is not None:
         values = np.array(table.values, float)
     else:
-        start, stop = (float(cast(float, end)) for end in (table.start, table.stop))
-        space = np.geomspace if table.scale == "log" else np.linspace
-        values = space(start, stop, 2 if table.num is None else table.num)
+        if missing := [key for key in ("start", "stop") if key not in keys]:
+            allowed = "start and stop" if continuous else "start, stop and num, or values"
+            raise InputError(f"{field}.{missing[0]}: missing; expected {allowed}")
+        start, stop, num = cast(float, table.start), cast(float, table.stop), 2 if continuous else table.num
+        if continuous and not start < stop:
+            raise InputError(f"{field}.stop = {stop!r}: expected stop > start = {start!r}")
+        if num is None:
+            raise InputError(f"{field}.num: missing; expected num >= 1 (a range without num: analysis = 'atlas')")
+        if num < 1:
+            raise InputError(f"{field}.num = {num}: empty axis; expected num >= 1")
+        if num == 1 and start != stop:
+            ends = f"start = {start!r} and stop = {stop!r}"
+            raise InputError(f"{field}.num = 1: {ends} are two values; expected num >= 2, or values = [{start!r}]")
+        check_total(num)
+        if num * _BYTES > (present := physical_memory()):
+            raise InputError(f"{field}.num = {num}: expected up to {int(present / _BYTES)} with this memory")
+        if table.scale not in (None, *_SCALES):
+            raise InputError(f"{field}.scale = {table.scale!r}: expected one of {', '.join(_SCALES)}")
+        if table.scale == "log" and not (start > 0 and stop > 0):
+            key, value = ("stop", stop) if start > 0 else ("start", start)
+            raise InputError(f"{field}.{key} = {value}: expected {key} > 0 on a log axis")
+        values = (np.geomspace if table.scale == "log" else np.linspace)(float(start), float(stop), num)
     ordered = np.sort(values)
     double = np.flatnonzero(ordered[1:] == ordered[:-1])
     if double.size:
         raise InputError(f"{field}: the value {ordered[double[0]]:.10g} occurs twice; expected distinct values")
     return values
+
+
+def check_total(count: int) -> None:
+    """Raise :class:`InputError` for too many points."""
+    if count > MAX_POINTS:
+        raise InputError(f"axes: {clipped(str(count))} points; expected up to {MAX_POINTS}")
 
 
 @dataclass(frozen=True)
@@ -281,8 +279,6 @@ class Grid:
 
         Fixed entries of lists stay numbers: kernels have them as constants, too.
         """
-        return {name: self._spread(value, points.shape) for name, value in self.bind(self.columns(points)).items()}
-
-    def _spread(self, value: Any, shape: tuple[int, ...]) -> Any:
-        whole = isinstance(value, (str, tuple)) or (self.path is not None and value is self.path.values)
-        return value if whole else np.broadcast_to(value, shape)
+        values, path = self.bind(self.columns(points)), self.path and self.path.values
+        whole = {n for n, x in values.items() if isinstance(x, (str, tuple)) or (path is not None and x is path)}
+        return {n: x if n in whole else np.broadcast_to(x, points.shape) for n, x in values.items()}

@@ -9,9 +9,8 @@ from drivetrain_jax._errors import InputError, aligned, did_you_mean, nearest, w
 from drivetrain_jax._quantities import Parameter, Variable
 from drivetrain_jax.analysis import analyses_of, analysis_names, broken_analyses, get_analysis
 from drivetrain_jax.runs import toml
-from drivetrain_jax.runs.scene import find_system
 from drivetrain_jax.runs.toml import entries
-from drivetrain_jax.systems import System, system_names
+from drivetrain_jax.systems import System, get_system, system_names
 
 
 def overview() -> str:
@@ -22,7 +21,7 @@ def overview() -> str:
 
 def _system_row(name: str) -> tuple[str, str]:
     try:
-        system = find_system(name)
+        system = get_system(name)
     except InputError as error:
         return name, str(error).partition(": ")[2]
     known = analysis_names()
@@ -41,7 +40,7 @@ def _broken_lines() -> list[str]:
 
 def describe(name: str) -> str:
     """Parameters, presets, analyses with results and options, and scenes of one system."""
-    system = find_system(name)
+    system = get_system(name)
     lines = [f"{system.name}: {system.title}", f"  {system.source}", "", "Parameters"]
     lines += aligned([_parameter_row(p) for p in system.parameters])
     if system.physical:
@@ -61,8 +60,8 @@ def _analysis_lines(name: str, system: type[System]) -> list[str]:
         analysis = get_analysis(name).for_system(system)
     except KeyError:
         return [f"Analysis {name}: unknown{nearest(name, analysis_names())}"]
-    except ImportError as error:
-        return [f"Analysis {name}: {' '.join(str(error).split())}"]
+    except InputError as error:
+        return [f"Analysis {name}: {str(error).partition(': ')[2]}"]
     lacking = analysis.lacks(system)
     lines = [f"Analysis {name}: {analysis.title}"]
     lines += aligned(

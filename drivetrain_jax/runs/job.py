@@ -44,7 +44,7 @@ class Block:
 class Job:
     """A problem and the route to its result. Blocks and kernels are created on first use.
 
-    Its kernels keep their chunk size for few points if ``full_size``. Jobs are equal if they have the same digest.
+    Its kernels keep their chunk size for few points if ``full_size``.
     """
 
     def __init__(self, problem: Problem, route: Route, *, full_size: bool = False) -> None:
@@ -79,12 +79,6 @@ class Job:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restored, (self.problem, self.route, self._full_size, self.boxes)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Job) and other.digest == self.digest
-
-    def __hash__(self) -> int:
-        return hash(self.digest)
 
     @cached_property
     def numerics(self) -> str:

@@ -10,7 +10,6 @@ from functools import lru_cache
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -18,6 +17,7 @@ from drivetrain_jax._programs import calls, compiled, program_identity
 from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import Analysis, Solver
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, on_cpu, options_for_few
+from drivetrain_jax.analysis.numerics.lanes import with_lanes
 from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.scene import Problem, result_variables
 from drivetrain_jax.systems import System
@@ -67,11 +67,8 @@ def _batch(
     dims = {v.name: len(v.dims) + (grid.path is not None) for v in variables}
 
     def batch(columns: Mapping[str, Any], numbers: Mapping[str, Any], effort: Array) -> dict[str, Array]:
-        # A result that does not depend on the varying parameters has no lanes yet.
         solved = solver.solve(grid.bind(columns, numbers), effort)
-        results = {name: jnp.asarray(value) for name, value in solved.items()}
-        spread = {n: v if v.ndim > dims[n] else v[..., None] for n, v in results.items()}
-        return {n: jnp.broadcast_to(v, (*v.shape[:-1], chunk)) for n, v in spread.items()}
+        return {name: with_lanes(value, dims[name], chunk) for name, value in solved.items()}
 
     columns = {part.name: jax.ShapeDtypeStruct((chunk,), part.values.dtype) for part in grid.varying}
     numbers = {name: np.float64(value) for name, value in grid.numbers.items()}

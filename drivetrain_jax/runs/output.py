@@ -16,15 +16,7 @@ import numpy as np
 import drivetrain_jax
 from drivetrain_jax._errors import InputError, did_you_mean
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.runs.assemble import (
-    BlockStore,
-    ResultBuffer,
-    ZarrBlocks,
-    labelled,
-    misfits,
-    stored_blocks,
-    with_pending,
-)
+from drivetrain_jax.runs.assemble import BlockStore, ResultBuffer, ZarrBlocks, labelled, stored_blocks, with_pending
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.reuse import NO_REUSE, NotReusable, ReusableResult, ReusedPoints, combined, differences, find
@@ -171,8 +163,7 @@ class Output:
         """The damaged parts of the present result of this scene, or of one whose digest is damaged; empty without damage."""
         if self.present not in (self.job.digest, ""):
             return ""
-        damage = self._files.damage(self.out)
-        return damage or checksums.named(misfits(self._files.layout(self.out), self.job.scene))
+        return self._files.damage(self.out)
 
     @cached_property
     def _found(self) -> ReusableResult | NotReusable | None:
@@ -256,10 +247,7 @@ class Output:
     def counted(self) -> tuple[int, np.ndarray]:
         """Number of points of the complete result, and their outcomes; of an atlas its solves, which have no outcomes."""
         if self.job.scene.analysis.continuous:
-            try:
-                return int(self._files.attributes(self.out)["solves"]), np.empty(0, OUTCOME.dtype)
-            except (KeyError, TypeError, ValueError):
-                raise self.error("no atlas has these attributes; --fresh replaces it") from None
+            return int(self._files.attributes(self.out)["solves"]), np.empty(0, OUTCOME.dtype)
         return self.job.total, self._files.map_variable(self.out, OUTCOME.name)
 
 

@@ -24,7 +24,7 @@ from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver,
 from drivetrain_jax.analysis._base import dimensions_of, make_request
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
 from drivetrain_jax.runs import toml
-from drivetrain_jax.runs.axes import Axis, axis_table, check_count, entry_of, spread
+from drivetrain_jax.runs.axes import Axis, axis_table, axis_values, entry_of
 from drivetrain_jax.runs.run import run
 from drivetrain_jax.runs.scene import FUNCTION, Scene
 from drivetrain_jax.systems import Model, System, get_system, system_names
@@ -32,8 +32,6 @@ from drivetrain_jax.systems import Model, System, get_system, system_names
 if TYPE_CHECKING:
     import xarray as xr
 
-# Points per chunk of a user's function, whose cost is unknown.
-_CHUNK = 256
 # The fixed word that identifies what a function computes.
 _COMPUTES = "computes"
 # Names that files can store, and names that they use themselves.
@@ -85,7 +83,7 @@ def sweep(
     name = function.name if of_another_package else getattr(function, "__name__", "")
     results, dims = (), ()
     if of_another_package or (name in analysis_names() and getattr(analyses, name, None) is function):
-        _, analysis = analyses.model_and_analysis(name, system)
+        analysis = analyses.checked_analysis(name, system)
         if system.name in system_names() and get_system(system.name) is type(system):
             return run(_scene_table(name, system, over, outputs, options), out=out, fresh=fresh)
         # A scene names its system, so any other class is that of a function.
@@ -136,8 +134,7 @@ def _function_scene(
             raise InputError(f"over.{name}: a word cannot vary; expected numbers")
         scalar = replace(described, name=name, listed=False, broadcast=False)
         table, _ = axis_table(scalar, name, toml.plain(entries), "over", keep=False)
-        check_count(f"over.{name}", table, continuous=False)
-        values[name] = spread(table, f"over.{name}")
+        values[name] = axis_values(table, f"over.{name}")
         parameters.append(Parameter(name, described.units, described.long_name))
     name = re.sub(r"\W", "_", getattr(function, "__name__", "function")).strip("_") or "value"
     keywords = {"outputs": outputs} if results and outputs is not None else {}
@@ -148,11 +145,20 @@ def _function_scene(
     example = {key: jax.ShapeDtypeStruct((), float) for key in values}
     traced, shapes = jax.make_jaxpr(one, return_shape=True)(example)
     _check_concrete(traced.consts)
-    wanted = _wanted(outputs, [key for key in shapes if key != OUTCOME.name], name)
+    offered = [key for key in shapes if key != OUTCOME.name]
+    wanted = [key for key in (offered if outputs is None else outputs) if key != OUTCOME.name]
+    if (lacking := next((key for key in wanted if key not in offered), None)) is not None:
+        raise InputError(f"outputs: {lacking!r} is not a result of {name}{nearest(str(lacking), offered)}")
+    if offered and not wanted:
+        raise InputError(f"outputs = {shown(outputs)}: expected one or more of {', '.join(offered)}")
     content = [re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr)), *(np.asarray(x).tobytes() for x in traced.consts)]
     computes = hashlib.blake2b(repr(content).encode(), digest_size=16).hexdigest()
     words = {variable.name: variable for variable in results}
-    variables = tuple(words.get(key) or _variable(key, shapes[key]) for key in wanted)
+    for key in wanted:
+        shape, dims_of_key = shapes[key], tuple(f"{key}_{i}" for i in range(len(shapes[key].shape)))
+        dtype = "int8" if shape.dtype == bool else str(shape.dtype)
+        words.setdefault(key, Variable(key, "1", key, dims_of_key, dtype))
+    variables = tuple(words[key] for key in wanted)
     kind, analysis = _kind(_Once(one), name, tuple(parameters), type(system), variables, dims, computes)
     axes = tuple(Axis(key, kind.parameter(key), None, numbers) for key, numbers in values.items())
     names = [*(axis.dim for axis in axes), *wanted, *dict.fromkeys(dim for v in variables for dim in v.dims)]
@@ -184,39 +190,21 @@ def _kind(
     varies = tuple(parameter.name for parameter in parameters)
     computing = Parameter(_COMPUTES, "1", "digest of what the function computes", text=True)
 
-    def build(values: Mapping[str, Any]) -> Mapping[str, Any]:
-        return values
-
     def solve(values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
         returned = one.call({key: values[key] for key in varies})
         results = {v.name: returned[v.name].astype(v.dtype) for v in variables}
         return _with_outcome(results, returned.get(OUTCOME.name))
 
-    def solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
-        return (Solver(name, over_lanes(solve), chunk=_CHUNK),)
-
     entries = {dim: v.name for v in variables for dim in v.dims}
     numbered = {dim: Dimension(dim, f"number of the entry of {name}", ()) for dim, name in entries.items()}
     dimensions = tuple((numbered | {d.name: d for d in dims if d.name in entries}).values())
-    body = {
-        "name": FUNCTION,
-        "title": of.__name__,
-        "parameters": (*parameters, computing),
-        "models": {name: Model(build, varies)},
-    }
+    models = {name: Model(lambda values: values, varies)}
+    body = {"name": FUNCTION, "title": of.__name__, "parameters": (*parameters, computing), "models": models}
     # Analyses ask for them, and figures show them.
     body |= {key: getattr(of, key) for key in ("state", "state_axis", "displacements") if issubclass(of, System)}
-    analysis = Analysis(
-        name,
-        f"function {name}",
-        variables,
-        tuple(v.name for v in variables),
-        {"function": ()},
-        (),
-        solvers,
-        lambda *_: dimensions,
-    )
-    return type("Function", (System,), body), analysis
+    outputs, methods, solver = (tuple(v.name for v in variables), {"function": ()}, Solver(name, over_lanes(solve)))
+    given = (name, f"function {name}", variables, outputs, methods, (), lambda *_: (solver,), lambda *_: dimensions)
+    return type("Function", (System,), body), Analysis(*given)
 
 
 def _with_outcome(results: Mapping[str, Array], code: Array | None) -> dict[str, Array]:
@@ -228,11 +216,6 @@ def _with_outcome(results: Mapping[str, Array], code: Array | None) -> dict[str,
     finite = jnp.all(jnp.array([True, *(jnp.all(jnp.isfinite(results[name])) for name in inexact)]))
     state = jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE).astype(jnp.int8)
     return {n: jnp.where(finite, x, jnp.nan) if n in inexact else x for n, x in results.items()} | {OUTCOME.name: state}
-
-
-def _variable(name: str, shape: jax.ShapeDtypeStruct) -> Variable:
-    dtype = "int8" if shape.dtype == bool else str(shape.dtype)
-    return Variable(name, "1", name, tuple(f"{name}_{i}" for i in range(len(shape.shape))), dtype)
 
 
 def _named(result: Any, name: str) -> dict[str, Array]:
@@ -255,17 +238,6 @@ def _named(result: Any, name: str) -> dict[str, Array]:
     return arrays
 
 
-def _wanted(outputs: Sequence[str] | None, known: Sequence[str], name: str) -> list[str]:
-    """Names of the results to store; the outcome is always one."""
-    wanted = [key for key in (known if outputs is None else outputs) if key != OUTCOME.name]
-    for key in wanted:
-        if key not in known:
-            raise InputError(f"outputs: {key!r} is not a result of {name}{nearest(str(key), known)}")
-    if known and not wanted:
-        raise InputError(f"outputs = {shown(outputs)}: expected one or more of {', '.join(known)}")
-    return wanted
-
-
 def _check_concrete(*values: Any) -> None:
     """Check that there are numbers for a file and a dataset."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values)):
@@ -279,23 +251,20 @@ def replaced(system: Any, point: Mapping[str, Any]) -> Any:
     """``system`` with these parameters, keys or attributes, or entries of them, replaced."""
     for name, value in point.items():
         base = entry_of(name)[0]
-        if base not in (names := _names(system)):
+        if isinstance(system, Mapping):
+            names, old = list(system), system.get(base)
+        else:
+            fallback = list(getattr(system, "_fields", getattr(system, "__dict__", ())))
+            names = [field.name for field in fields(system)] if is_dataclass(system) else fallback
+            old = getattr(system, base, None)
+        if base not in names:
             raise InputError(f"over.{name}: unknown to a {type(system).__name__}{nearest(base, names)}")
-        value = _replaced(system, system[base] if isinstance(system, Mapping) else getattr(system, base), name, value)
+        value = _replaced(system, old, name, value)
         if isinstance(system, Mapping):
             system = {**system, base: value}
         else:
             system = eqx.tree_at(lambda s, base=base: getattr(s, base), system, value, is_leaf=lambda x: x is None)
     return system
-
-
-def _names(system: Any) -> list[str]:
-    """Names of the keys, fields or attributes of a pytree."""
-    if isinstance(system, Mapping):
-        return list(system)
-    if is_dataclass(system):
-        return [field.name for field in fields(system)]
-    return list(getattr(system, "_fields", getattr(system, "__dict__", ())))
 
 
 def _replaced(system: Any, old: Any, name: str, value: Array) -> Any:

@@ -35,15 +35,22 @@ def described(system: type[System]) -> dict[str, Parameter]:
 def with_parameters(
     system: type[System], axes: tuple[Axis, ...], zipped: bool, fixed: Mapping[str, Any]
 ) -> tuple[tuple[Axis, ...], dict[str, Any], dict[str, Any]]:
-    """The axes and the fixed values of a scene with the parameters of ``system`` in place of physical data; and these data.
-
-    Raises :class:`InputError` for data that are missing, not used, or given together with what follows from them.
-    """
+    """The axes and the fixed values of a scene with parameters of ``system`` in place of physical data; and these data."""
     physical = system.physical
     swept = [axis for axis in axes if physical and entry_of(axis.name)[0] in physical.names]
     if physical is None or not (swept or any(name in physical.names for name in fixed)):
         return axes, dict(fixed), {}
-    known = _known(system, axes, zipped, fixed)
+    # All given values, in the units of their parameters or quantities.
+    known, described_as = dict(fixed), described(system)
+    for axis in axes:
+        base, entry = entry_of(axis.name)
+        given, wanted = axis.parameter.units, described_as[base].units
+        size = 1 if given == wanted else _units.factor(given, wanted)
+        value = Along(_POINT if zipped else axis.name, axis.values * size)
+        if entry is None:
+            known[base] = value
+        elif isinstance(whole := known.get(base), tuple) and entry < len(whole):
+            known[base] = (*whole[:entry], value, *whole[entry + 1 :])
     everything = physical.all_converted(known)
     parameters = {name: value for name, value in everything.items() if name not in physical.names}
     constant = {
@@ -58,22 +65,6 @@ def with_parameters(
 
 def _varies(value: Any) -> bool:
     return isinstance(value, Along) or (isinstance(value, tuple) and any(map(_varies, value)))
-
-
-def _known(system: type[System], axes: tuple[Axis, ...], zipped: bool, fixed: Mapping[str, Any]) -> dict[str, Any]:
-    """All given values in the units of their parameters or quantities."""
-    known, units = dict(fixed), described(system)
-    for axis in axes:
-        base, entry = entry_of(axis.name)
-        size = (
-            _units.factor(axis.parameter.units, units[base].units) if axis.parameter.units != units[base].units else 1
-        )
-        value = Along(_POINT if zipped else axis.name, axis.values * size)
-        if entry is None:
-            known[base] = value
-        elif isinstance(whole := known.get(base), tuple) and entry < len(whole):
-            known[base] = (*whole[:entry], value, *whole[entry + 1 :])
-    return known
 
 
 def _converted_axes(

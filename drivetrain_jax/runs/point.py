@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, KeysView, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError, aligned, did_you_mean, meant, shown, written
-from drivetrain_jax._quantities import Variable
-from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, get_analysis
+from drivetrain_jax._quantities import NamedResults, Variable
+from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, analysis_of, get_analysis
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
 from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range, orders_of
 from drivetrain_jax.runs import toml
@@ -34,12 +34,13 @@ from drivetrain_jax.runs.reply import (
     verdict_words,
 )
 from drivetrain_jax.runs.resolve import resolve
-from drivetrain_jax.runs.scene import Scene, load_scene, system_and_analysis
+from drivetrain_jax.runs.scene import Scene, load_scene
+from drivetrain_jax.systems import get_system
 from drivetrain_jax.view.style import in_units, ranges_text, runs_text, units_of, unstable_text
 
 
 @dataclass(frozen=True)
-class PointResult:
+class PointResult(NamedResults):
     """Results of one point, by attribute or by name: ``result.spectral_radius`` or ``result["spectral_radius"]``.
 
     ``outcome`` is the outcome of the point (results are NaN unless ``outcome.has_value``), ``units`` the units by name,
@@ -50,6 +51,7 @@ class PointResult:
     ``sensitivities`` those of the results, largest effect of one percent first (None unless asked for).
     """
 
+    _field: ClassVar[str] = "values"
     system: str
     analysis: str
     method: str
@@ -79,26 +81,6 @@ class PointResult:
     def units(self) -> dict[str, str]:
         """Units of the results."""
         return {name: self.variables[name].units for name in self.values}
-
-    def __getitem__(self, name: str) -> Any:
-        return self.values[name]
-
-    def __getattr__(self, name: str) -> Any:
-        # A copy asks before it has any attribute.
-        values = vars(self).get("values", {})
-        if name not in values:
-            raise AttributeError(f"no result {name!r}; there is {', '.join(values)}")
-        return values[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.values)
-
-    def keys(self) -> KeysView[str]:
-        """Names of the results, so that ``dict(result)`` contains them."""
-        return self.values.keys()
-
-    def __dir__(self) -> list[str]:
-        return sorted({*super().__dir__(), *self.values})
 
     @property
     def _reply(self) -> Reply:
@@ -140,7 +122,6 @@ class PointResult:
         multiplier lies within rounding of the unit circle."""
         # Local import: most points need no proof.
         from drivetrain_jax.atlas.proof import UNDECIDED, verdict_at
-        from drivetrain_jax.systems import get_system
 
         code = self.values.get("verdict", UNDECIDED)
         return code != UNDECIDED and verdict_at(get_system(self.system), self.parameters) == code
@@ -270,7 +251,7 @@ def point(
         tree["outputs"] = [*dict.fromkeys((*asked, *analysed.derivative_outputs(asked)))]
         job = resolve(load_scene(tree))
     limit = None if amplitude is None else Limit.from_text(job.scene.system, amplitude)
-    result = _result(job, _compute(job))
+    result = _result(job)
     if sensitivities:
         result = _with_sensitivities(result, replace(job.scene.request, outputs=asked), job.scene, given)
     return result if limit is None else replace(result, forced=_forced(result, given, limit))
@@ -297,7 +278,7 @@ def _in_units(value: Any, units: str, wanted: str) -> Any:
 
 def _varied(system: str, analysis: str, given: Mapping[str, Any]) -> str | None:
     """The parameter that has a range, a pair, in a question about stability; None without one."""
-    known = described(system_and_analysis(system, analysis)[0]) if analysis == "floquet" else {}
+    known = described(get_system(system)) if analysis == "floquet" else {}
     pairs = (name for name, value in given.items() if isinstance(value, tuple) and len(value) == 2)
     return next((name for name in pairs if name in known and known[name].is_number and not known[name].listed), None)
 
@@ -330,7 +311,7 @@ def _least_stable(system: str, name: str, given: Mapping[str, Any], asked: Mappi
 
 def _forced(result: PointResult, given: Mapping[str, Any], limit: Limit) -> tuple[str, dict[str, Any]]:
     """The comparison of the forced motion at the same point with a limit, as text and data."""
-    parameters = described(system_and_analysis(result.system, result.analysis)[0])
+    parameters = described(get_system(result.system))
     parameters = {name: value for name, value in given.items() if name in parameters}
     known = dict(result.values)
     for analysis, name in (("forced", "amplitude"), ("floquet", "verdict")):
@@ -341,7 +322,8 @@ def _forced(result: PointResult, given: Mapping[str, Any], limit: Limit) -> tupl
 
 def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """The scene of one point. Numbers are axes, so the next point needs no compilation; words and lists are fixed."""
-    system, analysis = system_and_analysis(system_name, analysis_name)
+    system = get_system(system_name)
+    analysis = analysis_of(system, analysis_name)
     if analysis.continuous:
         others = ", ".join(name for name in analyses_of(system) if not get_analysis(name).continuous)
         raise InputError(f"analysis = {analysis_name!r}: needs ranges; expected at a point one of {others}")
@@ -368,21 +350,21 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
     return tree
 
 
-def _compute(job: Job) -> ResultBuffer:
-    buffer = ResultBuffer(job.scene, job.grid)
+def _result(job: Job) -> PointResult:
+    scene, buffer = job.scene, ResultBuffer(job.scene, job.grid)
     for block in job.blocks():
         buffer.fill(job.points(block), job.compute_block(block))
-    return buffer
-
-
-def _result(job: Job, buffer: ResultBuffer) -> PointResult:
-    scene = job.scene
     first = (0,) * len(job.grid.result_shape)
     values = {v.name: buffer.lay_out()[v.name][first] for v in buffer.variables}
     outcome = Outcome(int(values.pop(OUTCOME.name)))
     parameters = {p.parameter.name: p.values[0].item() for a in scene.axes for p in a.together} | dict(scene.fixed)
-    ordered = {p.name: parameters[p.name] for p in scene.system.parameters if p.name in parameters}
-    physical = _physical(job)
+    ordered: dict[str, Any] = {p.name: parameters[p.name] for p in scene.system.parameters if p.name in parameters}
+    known, physical = described(scene.system), {}
+    for axis in scene.axes:
+        physical |= {quantity.name: (quantity.values[0].item(), quantity.parameter.units) for quantity in axis.given}
+    physical |= {name: (value, known[name].units) for name, value in scene.data.items()}
+    shown = [v for v in buffer.variables if v.name in values]
+    sizes = {dim: n for v in shown for dim, n in zip(v.dims, np.shape(values[v.name]), strict=True)}
     model = scene.analysis.model(scene.system)
     # The sentence needs all results.
     says = model.says if outcome.has_value and all(v.name in values for v in model.results) else None
@@ -401,7 +383,7 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
         outcome=outcome,
         variables={v.name: v for v in buffer.variables},
         parameter_units={p.name: p.units for p in scene.system.parameters},
-        labels=_labels(job, values, buffer),
+        labels={d.name: d.labels(sizes[d.name]) for d in scene.dimensions if d.name in sizes},
         physical=physical,
         remedy=scene.analysis.remedy(scene.request),
         advice=scene.analysis.advice(scene.request),
@@ -409,22 +391,6 @@ def _result(job: Job, buffer: ResultBuffer) -> PointResult:
         orders=orders,
         sentence=sentence or (orders.sentence(values, ordered) if orders else ""),
     )
-
-
-def _physical(job: Job) -> dict[str, tuple[Any, str]]:
-    """The given physical data with their units."""
-    scene, data = job.scene, {}
-    for axis in scene.axes:
-        data |= {quantity.name: (quantity.values[0].item(), quantity.parameter.units) for quantity in axis.given}
-    known = described(scene.system)
-    return data | {name: (value, known[name].units) for name, value in scene.data.items()}
-
-
-def _labels(job: Job, values: Mapping[str, Any], buffer: ResultBuffer) -> dict[str, Sequence[Any]]:
-    """The entries of every dimension of ``values``: coordinates, or numbers."""
-    shown = [v for v in buffer.variables if v.name in values]
-    sizes = {dim: n for v in shown for dim, n in zip(v.dims, np.shape(values[v.name]), strict=True)}
-    return {d.name: d.labels(sizes[d.name]) for d in job.scene.dimensions if d.name in sizes}
 
 
 # First samples of a range.

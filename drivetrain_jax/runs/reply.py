@@ -25,8 +25,8 @@ from drivetrain_jax.analysis import Analysis
 from drivetrain_jax.analysis._base import checked
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
 from drivetrain_jax.runs.physical import GivenData, described
-from drivetrain_jax.runs.scene import Scene, find_system
-from drivetrain_jax.systems import System
+from drivetrain_jax.runs.scene import Scene
+from drivetrain_jax.systems import System, get_system
 from drivetrain_jax.view.style import parameters, scene_key, units_of
 
 if TYPE_CHECKING:
@@ -82,37 +82,6 @@ def plain(value: Any) -> Any:
     return np.asarray(value).item() if np.isfinite(value) else None
 
 
-class Growth(NamedTuple):
-    """``rate`` [1/s], negative for decay; ``per_turn``, the factor of the amplitude per turn of the shaft;
-    ``time_to_double`` and ``time_to_halve`` [s] and ``turns_to_double`` and ``turns_to_halve``, infinite for the other case.
-    """
-
-    rate: np.ndarray
-    per_turn: np.ndarray
-    time_to_double: np.ndarray
-    time_to_halve: np.ndarray
-    turns_to_double: np.ndarray
-    turns_to_halve: np.ndarray
-
-
-def growth(spectral_radius: Any, period: Any, turn: Any) -> Growth:
-    """The growth that a ``spectral_radius`` over one ``period`` [s] means; a ``turn`` of the shaft takes so long [s].
-
-    ``rate = ln(spectral_radius)/period`` is the largest real part of the Floquet exponents. The equations of a cardan shaft
-    have two periods in a turn.
-
-    >>> found = growth(1.02, period=0.02, turn=0.04)
-    >>> print(found.rate.round(4), found.time_to_double.round(4), found.turns_to_double.round(2))
-    0.9901 0.7001 17.5
-    """
-    radius, period, turn = np.broadcast_arrays(*(np.asarray(x, float) for x in (spectral_radius, period, turn)))
-    with np.errstate(divide="ignore"):
-        rate = np.log(radius) / period
-        # Not `way > 0`: NaN stays NaN.
-        double, halve = (np.where(way <= 0, np.inf, np.log(2) / np.abs(way)) for way in (rate, -rate))
-    return Growth(rate, np.exp(rate * turn), double, halve, double / turn, halve / turn)
-
-
 def growth_at(asked: AtlasQuery, results: Mapping[str, Any]) -> dict[str, float]:
     """The growth that ``spectral_radius`` means at the point of the question; empty if it is not known."""
     system = asked.atlas.scene.system
@@ -125,7 +94,12 @@ def growth_at(asked: AtlasQuery, results: Mapping[str, Any]) -> dict[str, float]
 def growth_of(
     system: type[System], point: Mapping[str, Any], results: Mapping[str, Any], turns: float | None
 ) -> dict[str, float]:
-    """The growth at a ``point`` (parameters); ``turns`` is the speed [rpm], if known, of a shaft whose time has no unit."""
+    """The growth that a spectral radius means at a ``point`` (parameters); empty if it is not known.
+
+    ``rate = ln(spectral_radius)/period`` [1/s] is the largest real part of the Floquet exponents, negative for decay;
+    ``per_turn`` is the factor of the amplitude per turn of the shaft; ``time_to_double`` or ``time_to_halve`` [s] and the
+    same in turns follow. ``turns`` is the speed [rpm], if known, of a shaft whose time has no unit.
+    """
     radius = results.get("spectral_radius")
     frequency = point.get(system.roles.get("speed", "")) if system.time_units == "s" else None
     # An undecided radius is 1 within its error, and so is its growth 0; without damping it is 1.
@@ -134,7 +108,10 @@ def growth_of(
         return {}
     # A period takes 1/frequency seconds; otherwise the unit of time is the turn.
     turn = 60 / turns if turns else 1.0
-    rates = growth(radius, 1 / frequency if frequency else turn / system.periods_per_turn, turn)._asdict()
+    with np.errstate(divide="ignore"):
+        rate = np.log(radius) * (frequency or system.periods_per_turn / turn)
+    way, time = "double" if rate > 0 else "halve", np.log(2) / np.abs(rate)
+    rates = {"rate": rate, "per_turn": np.exp(rate * turn), f"time_to_{way}": time, f"turns_to_{way}": time / turn}
     names = ("rate", "time") if frequency else ("rate", "per", "time", "turns") if turns else ("per", "turns")
     return {n: float(x) for n, x in rates.items() if np.isfinite(x) and n.startswith(names)}
 
@@ -185,10 +162,16 @@ class Sensitivity(NamedTuple):
     output: str = "spectral_radius"
 
 
-def radius_sensitivities(asked: AtlasQuery, slopes: Mapping[str, float]) -> list[Sensitivity]:
+def radius_sensitivities(asked: AtlasQuery, slopes: Mapping[str, float] | None) -> list[Sensitivity] | None:
     """Sensitivities of the spectral radius at the point of a question; ``slopes`` is its gradient by the parameters."""
+    if slopes is None:
+        return None
+
+    def change(changes: Mapping[str, Any], _: Any) -> Any:
+        return sum((slopes[name] * x for name, x in changes.items() if name in slopes), 0.0)
+
     point = {**asked.atlas.fixed, **asked.values}
-    return _of_radius(asked.atlas.scene.system, asked.shaft, point, slopes)
+    return _of_data(asked.atlas.scene.system, asked.shaft, point, "", change)
 
 
 def differentiable(analysis: Analysis, outputs: Iterable[str]) -> list[Variable]:
@@ -251,15 +234,6 @@ def point_sensitivities(
         ]
         effects += sorted(of_output, key=lambda effect: -np.max(np.abs(np.nan_to_num(effect.percent))))
     return effects
-
-
-def _of_radius(
-    system: type[System], shaft: GivenData | None, point: Mapping[str, Any], slopes: Mapping[str, float]
-) -> list[Sensitivity]:
-    def change(changes: Mapping[str, Any], _: Any) -> Any:
-        return sum((slopes[name] * x for name, x in changes.items() if name in slopes), 0.0)
-
-    return _of_data(system, shaft, point, "", change)
 
 
 def limit_sensitivities(asked: AtlasQuery, parameter: str, limit: Crossing) -> list[Sensitivity]:
@@ -437,12 +411,8 @@ class Limit:
         doubt = " if the motion is stable, which is undecided" if within is None else ""
         values = [float(a) if np.isfinite(a) else None for a in amplitudes]
         text = f"{listed}; {compared} the limit of {self.written(self.value)}{doubt}" if known else "no value"
-        return text, {
-            "amplitude": dict(zip(names, values, strict=True)),
-            "limit": self.value,
-            "units": self.own,
-            "within": within,
-        }
+        data = {"amplitude": dict(zip(names, values, strict=True)), "limit": self.value, "units": self.own}
+        return text, data | {"within": within}
 
     def along(
         self, amplitude: Callable[[np.ndarray], np.ndarray], low: float, high: float, likely: np.ndarray
@@ -502,7 +472,7 @@ def with_unstable_ranges(dataset: xr.Dataset) -> tuple[xr.Dataset, float]:
         # Above 1 is what the verdict calls unstable.
         return np.where(unstable, np.maximum(radius, 1 + 1e-15), np.minimum(radius, 1.0))[:, None]
 
-    known, fixed = find_system(str(dataset.attrs["system"])).resonances, parameters(dataset)
+    known, fixed = get_system(str(dataset.attrs["system"])).resonances, parameters(dataset)
     foretold = known is not None and known.axis == name and set(known.parameters) <= fixed.keys()
     predicted, labels = (known.values(fixed), known.labels) if known and foretold else (np.empty(0), ())
     likely = np.concatenate([axis.values, predicted[np.isfinite(predicted)]])
@@ -558,31 +528,9 @@ class Along:
     @property
     def data(self) -> dict[str, Any]:
         """The amplitudes as plain numbers."""
-        return {
-            "limit": self.limit.value,
-            "units": self.limit.own,
-            "largest": self.largest,
-            "where": self.where,
-            "displacement": self.name,
-            "within": [list(ends) for ends in self.within],
-        }
-
-
-def forced_along(atlas: Any, limit: Limit, ends: tuple[float, float], at: Mapping[str, float]) -> Along:
-    """The amplitudes of a stored atlas along its speed, with the other parameters ``at``; no value counts as infinite."""
-    system = atlas.scene.system
-    speed, predicted = system.roles["speed"], system.resonances
-
-    def amplitude(speeds: np.ndarray) -> np.ndarray:
-        columns = {name: np.full(speeds.size, at[name]) for name in atlas.parameters if name != speed}
-        return np.nan_to_num(atlas.amplitude({**columns, speed: speeds}), nan=np.inf)
-
-    likely = np.empty(0)
-    if predicted and predicted.axis == speed:
-        forced = tuple(family.prefix for family in predicted.families if family.forced)
-        excited = [bool(forced) and label.startswith(forced) for label in predicted.labels]
-        likely = np.asarray(predicted.values({**atlas.fixed, **at}), float)[np.array(excited)]
-    return limit.along(amplitude, *ends, likely)
+        place = {"largest": self.largest, "where": self.where, "displacement": self.name}
+        within = [list(ends) for ends in self.within]
+        return {"limit": self.limit.value, "units": self.limit.own, **place, "within": within}
 
 
 def forced_at(atlas: Any, amplitude: Any, point: Mapping[str, float], verdict: Any) -> tuple[list[str], dict[str, Any]]:
@@ -602,8 +550,20 @@ def forced_over(
     """The comparison with a limit in ``ranges`` of speed: lines for each, and data; no lines without a limit."""
     if amplitude is None:
         return [[] for _ in ranges], {}
-    limit, speed = Limit.from_text(atlas.scene.system, amplitude), atlas.scene.system.roles["speed"]
-    compared = [forced_along(atlas, limit, ends, at) for ends in ranges]
+    system = atlas.scene.system
+    limit, speed, predicted = Limit.from_text(system, amplitude), system.roles["speed"], system.resonances
+
+    def amplitudes(speeds: np.ndarray) -> np.ndarray:
+        """The amplitudes with the other parameters ``at``; no value counts as infinite."""
+        columns = {name: np.full(speeds.size, at[name]) for name in atlas.parameters if name != speed}
+        return np.nan_to_num(atlas.amplitude({**columns, speed: speeds}), nan=np.inf)
+
+    likely = np.empty(0)
+    if ranges and predicted and predicted.axis == speed:
+        forced = tuple(family.prefix for family in predicted.families if family.forced)
+        excited = [bool(forced) and label.startswith(forced) for label in predicted.labels]
+        likely = np.asarray(predicted.values({**atlas.fixed, **at}), float)[np.array(excited)]
+    compared = [limit.along(amplitudes, low, high, likely) for low, high in ranges]
     return [[along.text(lambda x: named(speed, x))] for along in compared], {
         "forced": [along.data for along in compared]
     }

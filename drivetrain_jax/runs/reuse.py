@@ -19,7 +19,7 @@ import numpy as np
 import drivetrain_jax
 from drivetrain_jax._errors import InputError, clipped, counted
 from drivetrain_jax.analysis import OUTCOME, Outcome
-from drivetrain_jax.runs.assemble import misfits, sweep_first
+from drivetrain_jax.runs.assemble import sweep_first
 from drivetrain_jax.runs.axes import Grid, entry_of
 from drivetrain_jax.runs.job import Job, scene_content
 from drivetrain_jax.runs.scene import Scene, is_of_function, restore_scene, result_variables
@@ -112,10 +112,7 @@ def combined(job: Job, results: Iterable[ReusableResult]) -> ReusedPoints:
 
 
 def find(job: Job, path: Path) -> ReusableResult:
-    """The points of ``job`` that the result at ``path`` contains, without lost ones.
-
-    Raises :class:`NotReusable`, or :class:`InputError` if there is no readable result.
-    """
+    """The points of ``job`` that the result at ``path`` contains, without lost ones."""
     try:
         attrs = consolidate.attributes(path)
     except InputError as error:
@@ -130,8 +127,9 @@ def find(job: Job, path: Path) -> ReusableResult:
     if reasons:
         raise NotReusable(path, reasons[0], "expected a result that differs in its points only")
     # The checksums of the new result would hide damage.
-    wrong = checksums.named(checksums.damaged(path) or misfits(consolidate.layout(path), scene))
-    if damage := wrong or ("" if "checksums" in attrs else "it has no checksums"):
+    if damage := checksums.named(checksums.damaged(path) or []) or (
+        "" if "checksums" in attrs else "it has no checksums"
+    ):
         raise NotReusable(path, f"damaged ({damage})", "restore the file or compute it again", damage)
     grid = Grid.of(scene)
     theirs, ours = _same_points(scene, grid, job)
@@ -248,25 +246,10 @@ def differences_of(scene: Scene, stored: Mapping[str, Any], job: Job, *, points:
     reasons = [
         f"{key} is {_text(new.get(key))}, was {_text(old.get(key))}"
         for key in {**new, **old}
-        if old.get(key) != new.get(key)
+        if not np.array_equal(old.get(key, ""), new.get(key, ""))
     ]
     missing = [] if points else [name for name in job.scene.request.outputs if name not in scene.request.outputs]
     return [*reasons, *([f"lacks {', '.join(missing)}"] if missing else []), *_of_code(stored, job)]
-
-
-@dataclass(frozen=True)
-class _Values:
-    """The values of an axis, as text their number and range."""
-
-    values: list[float]
-    continuous: bool
-
-    def __str__(self) -> str:
-        first, last = self.values[0], self.values[-1]
-        if self.continuous:
-            return f"the range from {first:.10g} to {last:.10g}"
-        ends = f"at {first:.10g}" if len(self.values) == 1 else f"from {first:.10g} to {last:.10g}"
-        return f"{counted(len(self.values), 'value', 'values')} {ends}"
 
 
 def _entries(scene: Scene, points: bool) -> dict[str, Any]:
@@ -278,7 +261,9 @@ def _entries(scene: Scene, points: bool) -> dict[str, Any]:
         shown = [axis.shown for axis in scene.axes]
         entries |= {"outputs": ", ".join(content["outputs"]), where: ", ".join(axis.name for axis in shown)}
         entries |= {f"fixed.{name}": value for name, value in sorted(content["fixed"].items())}
-        entries |= {f"{where}.{a.name}": _Values(a.values.tolist(), scene.analysis.continuous) for a in shown}
+        for axis in shown:
+            ends = " to ".join(f"{x:.15g}" for x in axis.values[[0, -1]])
+            entries[f"{where}.{axis.name}"] = f"the range from {ends}" if scene.analysis.continuous else axis.values
     return entries
 
 
@@ -305,4 +290,8 @@ def _of_code(stored: Mapping[str, Any], job: Job) -> Iterator[str]:
 
 
 def _text(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        first, last = value[0], value[-1]
+        ends = f"at {first:.10g}" if len(value) == 1 else f"from {first:.10g} to {last:.10g}"
+        return f"{counted(len(value), 'value', 'values')} {ends}"
     return "not given" if value is None else clipped(str(list(value) if isinstance(value, tuple) else value))

@@ -17,7 +17,6 @@ from drivetrain_jax.runs.assemble import ZarrBlocks
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.output import HDF5, ZARR, Output
 from drivetrain_jax.runs.resolve import resolve
-from drivetrain_jax.runs.reuse import ReusedPoints
 from drivetrain_jax.runs.scene import Scene, load_scene
 from drivetrain_jax.runs.work import Progress, Report, Threads, Work, make_executor
 from drivetrain_jax.store.consolidate import open_result
@@ -93,7 +92,7 @@ def run(
                 show(progress)
 
         if out is None:
-            return _in_memory(_job(scene, overrides, on_disk=False), executor, reported)
+            return _in_memory(resolve(load_scene(scene, overrides)), executor, reported)
         how: dict[str, Any] = {"fresh": fresh, "executor": executor, "reuse": reuse, "report": reported}
         try:
             run_to_file(scene, Path(out), overrides=overrides, store=HDF5, **how)
@@ -118,7 +117,7 @@ def run_to_file(
 
     ``store`` is ``hdf5`` or ``zarr``, of which each block is a shard; by default the name of ``out`` decides.
     """
-    job = _job(scene, overrides, on_disk=True)
+    job = resolve(load_scene(scene, overrides))
     named = ZARR if out.suffix.lower() == ".zarr" else HDF5
     if named == ZARR and store == HDF5:
         allowed = f"expected a name such as {out.stem}.nc, or `drivetrain run --store zarr`"
@@ -136,14 +135,8 @@ def run_to_file(
         raise output.error(output.reason)
     executor = executor or Threads()
     executor.check(job.problem.system)
-    paths = [reuse] if isinstance(reuse, (str, Path)) else reuse
-    return _into(output, output.reused_points(paths, fresh), fresh, executor, report)
-
-
-def _into(output: Output, reused: ReusedPoints, fresh: bool, executor: Threads, report: Report | None) -> Progress:
-    """Start or resume the result of ``output``; the points ``reused`` are reused."""
-    job, parts, progress = output.job, output.parts, Progress.before(output.job)
-    begins = False
+    reused = output.reused_points([reuse] if isinstance(reuse, (str, Path)) else reuse, fresh)
+    parts, progress, begins = output.parts, Progress.before(job), False
     try:
         parts.open()
         output.check_unchanged()
@@ -175,17 +168,12 @@ def _into(output: Output, reused: ReusedPoints, fresh: bool, executor: Threads, 
     return progress
 
 
-def _job(scene: str | Path | Mapping[str, Any] | Scene, overrides: Mapping[str, Any] | None, on_disk: bool) -> Job:
-    """The job of a scene, checked against the memory of this machine."""
-    job = resolve(scene if isinstance(scene, Scene) else load_scene(scene, overrides))
-    needed = 0 if on_disk or job.scene.analysis.continuous else job.total * job.scene.result_bytes
+def _in_memory(job: Job, executor: Threads, report: Report | None) -> xr.Dataset:
+    """The result of a job that the memory of this machine can hold."""
+    needed = 0 if job.scene.analysis.continuous else job.total * job.scene.result_bytes
     if needed > (present := physical_memory()):
         limit = f"expected up to {present / 1e9:.0f} GB here"
         raise InputError(f"axes: {job.total} points need {needed / 1e9:.0f} GB of memory; {limit}")
-    return job
-
-
-def _in_memory(job: Job, executor: Threads, report: Report | None) -> xr.Dataset:
     progress = Progress.before(job)
     try:
         work = Work(executor, report)

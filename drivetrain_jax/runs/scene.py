@@ -9,20 +9,19 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
 
-from drivetrain_jax._errors import InputError, clipped, did_you_mean, meant, nearest, shown
-from drivetrain_jax._machine import physical_memory
-from drivetrain_jax._quantities import Dimension, Parameter, Variable
-from drivetrain_jax.analysis import OUTCOME, Analysis, Request, Solver, analyses_of, get_analysis
+from drivetrain_jax._errors import InputError, meant, shown
+from drivetrain_jax._quantities import Dimension, Variable
+from drivetrain_jax.analysis import OUTCOME, Analysis, Request, Solver, analysis_of, get_analysis
 from drivetrain_jax.analysis._base import checked, checked_solvers, dimensions_of, make_request
 from drivetrain_jax.runs import toml
-from drivetrain_jax.runs.axes import MAX_POINTS, MAX_RANGES, Axis, AxisTable, axis_table, check_count, entry_of, spread
+from drivetrain_jax.runs.axes import MAX_RANGES, Axis, axis_table, axis_values, check_total, entry_of
 from drivetrain_jax.runs.physical import described, with_parameters
-from drivetrain_jax.systems import System, get_system, register, system_names
+from drivetrain_jax.systems import System, get_system, register
 
 Value = float | int | str | tuple[float, ...]
 Ranges = dict[str, tuple[float, float]]
@@ -78,7 +77,7 @@ class Problem:
     def is_named(self) -> bool:
         """True if the names of system and analysis determine both; False for a function that a user sweeps."""
         try:
-            system = find_system(self.system.name)
+            system = get_system(self.system.name)
             return system is self.system and self.find_analysis(self.analysis.name).for_system(system) == self.analysis
         except (InputError, KeyError):
             return False
@@ -93,7 +92,7 @@ def _restored(kind: type[Problem], values: dict[str, Any]) -> Problem:
     module, qualified, name = values["system"]
     # A worker imports the module of a class that is not installed.
     own = getattr(import_module(module), qualified, None)
-    system = find_system(name) if own is None else register(own)
+    system = get_system(name) if own is None else register(own)
     analysis = kind.find_analysis(values["analysis"]).for_system(system)
     return kind(**values | {"system": system, "analysis": analysis})
 
@@ -141,19 +140,18 @@ def is_of_function(text: object) -> bool:
     return str(text).startswith(f'system = "{FUNCTION}"\n')
 
 
-def load_scene(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Scene:
-    """Read and check a scene: a path, a name of `drivetrain list`, or a mapping with the same keys.
-
-    ``overrides``: see :func:`toml.read`.
-    Raises :class:`InputError` with one line that names the field, what was given and what is allowed.
-    """
+def load_scene(source: str | Path | Mapping[str, Any] | Scene, overrides: Mapping[str, Any] | None = None) -> Scene:
+    """Read and check a scene: a path, a name of `drivetrain list`, a mapping with the same keys, or a checked scene."""
+    if isinstance(source, Scene):
+        return source
     if isinstance(source, Mapping) and isinstance(source.get("system"), type):
         source = {**source, "system": register(source["system"]).name}
     tree, text = toml.read(source, overrides)
     if isinstance(names := tree.get("outputs"), str):
         tree = {**tree, "outputs": names.split(",")}
     table = toml.converted(tree, _SceneTable, "")
-    system, analysis = system_and_analysis(table.system, table.analysis)
+    system = get_system(table.system)
+    analysis = analysis_of(system, table.analysis)
     request = make_request(system, analysis, table.outputs, table.options, {*table.axes, *table.points})
     swept, zipped = axes_of(table.axes, table.points, system, analysis)
     axes, given, data = with_parameters(system, swept, zipped, _given(table, system, swept))
@@ -179,33 +177,6 @@ def restore_scene(text: object) -> Scene:
         return load_scene(tomllib.loads(str(text)))
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"scene: not valid TOML: {error}") from None
-
-
-def find_system(name: str) -> type[System]:
-    """The system of this name; ``InputError`` if it is unknown (with a similar name) or cannot be imported."""
-    try:
-        return get_system(name)
-    except KeyError:
-        raise InputError(f"system = {name!r}: unknown{nearest(str(name), system_names())}") from None
-    except ImportError as error:
-        # The message of the package on one line.
-        raise InputError(f"system = {name!r}: {' '.join(str(error).split())}") from error
-
-
-def system_and_analysis(system_name: str, analysis_name: str) -> tuple[type[System], Analysis]:
-    """The system and the analysis of these names; ``InputError`` if one is unknown, or if they do not match."""
-    system = find_system(system_name)
-    try:
-        analysis = get_analysis(analysis_name)
-        analysis.model(system)
-    except KeyError:
-        known = analyses_of(system)
-        guess = did_you_mean(str(analysis_name), known)
-        allowed = f"expected for {system.name} one of {', '.join(known)}"
-        raise InputError(f"analysis = {analysis_name!r}: unknown{guess}; {allowed}") from None
-    except ImportError as error:
-        raise InputError(f"analysis = {analysis_name!r}: {' '.join(str(error).split())}") from error
-    return system, analysis.for_system(system)
 
 
 def _given(table: _SceneTable, system: type[System], axes: tuple[Axis, ...]) -> dict[str, Any]:
@@ -240,9 +211,16 @@ def _fixed(
         data = system.physical.source(missing[0].name) if system.physical else ""
         either = f", or physical data: {data}" if data else ""
         raise InputError(f"fixed.{missing[0].name}: missing; expected {missing[0].allowed_in_units}{others}{either}")
-    for axis in axes:
-        for part in axis.together:
-            _check_entry(part, fixed, where)
+    for axis in (part for whole_axis in axes for part in whole_axis.together if part.entry is not None):
+        # The list supplies its length and the other entries; an empty one is the default "none".
+        name, whole = axis.parameter.name, fixed.get(axis.parameter.name, ())
+        if whole == ():
+            allowed = f"varies one entry of this list; expected {axis.parameter.allowed}"
+            raise InputError(f"fixed.{name}: missing; {axis.name} {allowed}")
+        if not isinstance(whole, tuple):
+            raise InputError(f"fixed.{name} = {whole}: {axis.name} varies one entry; expected a list of numbers")
+        if cast(int, axis.entry) >= len(whole):
+            raise InputError(f"{where}.{axis.name}: expected {name}[0] to {name}[{len(whole) - 1}]")
     if check := analysis.model(system).check:
         try:
             check(fixed)
@@ -270,31 +248,10 @@ def _check_path(scene: Scene) -> None:
         raise InputError(f"options: {name!r} is not an axis of the scene; {allowed}")
 
 
-def _check_entry(axis: Axis, fixed: Mapping[str, Value], where: str) -> None:
-    """Check that the whole list is fixed if one entry is swept; the list supplies its length and the other entries."""
-    name = axis.parameter.name
-    if axis.entry is None:
-        return
-    # An empty list is the default "none".
-    if fixed.get(name, ()) == ():
-        raise InputError(
-            f"fixed.{name}: missing; {axis.name} varies one entry of this list; expected {axis.parameter.allowed}"
-        )
-    whole = fixed[name]
-    if not isinstance(whole, tuple):
-        raise InputError(f"fixed.{name} = {whole}: {axis.name} varies one entry; expected a list of numbers")
-    if axis.entry >= len(whole):
-        raise InputError(f"{where}.{axis.name}: expected {name}[0] to {name}[{len(whole) - 1}]")
-
-
-# Bytes per value of an axis while it is created and checked.
-_BYTES = 32
-
-
 def axes_of(
     axes: Mapping[str, Any], points: Mapping[str, Any], system: type[System], analysis: Analysis
 ) -> tuple[tuple[Axis, ...], bool]:
-    """The varying parameters; their values are counted before they are computed."""
+    """The varying parameters, and True for lists of points."""
     if axes and points:
         raise InputError("points: given together with axes; expected one of the two")
     if analysis.continuous and points:
@@ -302,63 +259,41 @@ def axes_of(
     if analysis.continuous and not 1 <= len(axes) <= MAX_RANGES:
         raise InputError(f"axes: {len(axes)} are given; {analysis.name} allows 1 to {MAX_RANGES}")
     where = "points" if points else "axes"
-    swept = {name: _swept_parameter(system, where, name) for name in axes or points}
-    specs = {}
-    for name, parameter in swept.items():
+    known, varying = described(system), list[Axis]()
+    for name, keys in (axes or points).items():
+        base, entry = entry_of(name)
+        parameter = known.get(base)
+        if parameter is None:
+            raise InputError(f"{where}.{name}: {unknown_parameter(system, base)}")
+        if parameter.choices or parameter.text:
+            raise InputError(f"{where}.{name}: a word cannot vary; fix it: {parameter.allowed}")
+        if not parameter.is_number and entry is None:
+            one = f'expected one entry, for example "{name}[0]"'
+            raise InputError(f"{where}.{name}: a list cannot vary as a whole; {one}")
+        if entry is not None and not parameter.listed:
+            raise InputError(f"{where}.{name}: {base} is not a list; expected {base}")
         if analysis.continuous and parameter.integer:
             allowed = f"expected for {analysis.name} a parameter with a continuous range"
             raise InputError(f"axes.{name}: an integer; {allowed}")
-        if points and not isinstance(points[name], list):
-            raise InputError(f"points.{name} = {shown(points[name])}: expected a list of numbers")
+        if points and not isinstance(keys, list):
+            raise InputError(f"points.{name} = {shown(keys)}: expected a list of numbers")
         # The unit of physical data is that of the scene.
-        keep = system.physical is not None and entry_of(name)[0] in system.physical.names
-        specs[name] = axis_table(parameter, name, (axes or points)[name], where, keep=keep)
-    if points:
-        return _points(points, specs), True
-    counts = {name: check_count(f"axes.{name}", spec, analysis.continuous) for name, (spec, _) in specs.items()}
-    total = math.prod(counts.values())
-    if total > MAX_POINTS:
-        raise InputError(f"axes: {clipped(str(total))} points; expected up to {MAX_POINTS}")
-    most, present = max(counts.values(), default=0), physical_memory()
-    if most * _BYTES > present:
-        name = max(counts, key=lambda name: counts[name])
-        raise InputError(f"axes.{name}.num = {most}: expected up to {int(present / _BYTES)} with this memory")
-    found = []
-    for name, (table, scalar) in specs.items():
-        values = spread(table, f"axes.{name}")
-        for value in values if scalar.integer else ():
+        keep = system.physical is not None and base in system.physical.names
+        one_number = replace(parameter, name=name, listed=False, broadcast=False)
+        table, scalar = axis_table(one_number, name, keys, where, keep=keep)
+        values = table.values if points else axis_values(table, f"axes.{name}", analysis.continuous)
+        numbers = np.asarray(values, float)
+        for value in numbers if axes and scalar.integer else ():
             checked(scalar, float(value), "axes.")
-        found.append(_axis(name, values, scalar))
-    return tuple(found), False
-
-
-def _axis(name: str, values: Any, scalar: Parameter) -> Axis:
-    base, entry = entry_of(name)
-    return Axis(name, replace(scalar, name=base), entry, np.asarray(values, np.int64 if scalar.integer else float))
-
-
-def _points(points: Mapping[str, Any], specs: Mapping[str, tuple[AxisTable, Parameter]]) -> tuple[Axis, ...]:
-    """Columns of parameter values of equal length."""
-    lengths = {name: len(values) for name, values in points.items()}
-    if len(set(lengths.values())) > 1 or not all(lengths.values()):
+        numbers = numbers.astype(np.int64) if scalar.integer else numbers
+        varying.append(Axis(name, replace(scalar, name=base), entry, numbers))
+    lengths = {axis.name: len(axis.values) for axis in varying}
+    if points and (len(set(lengths.values())) > 1 or not all(lengths.values())):
         listed = ", ".join(f"{name} has {length}" for name, length in lengths.items())
         raise InputError(f"points: {listed}; expected lists of one length, at least 1")
-    return tuple(_axis(name, table.values, scalar) for name, (table, scalar) in specs.items())
-
-
-def _swept_parameter(system: type[System], where: str, name: str) -> Parameter:
-    """The range of one number of the axis ``name``, under that name."""
-    base, entry = entry_of(name)
-    parameter = described(system).get(base)
-    if parameter is None:
-        raise InputError(f"{where}.{name}: {unknown_parameter(system, base)}")
-    if parameter.choices or parameter.text:
-        raise InputError(f"{where}.{name}: a word cannot vary; fix it: {parameter.allowed}")
-    if not parameter.is_number and entry is None:
-        raise InputError(f'{where}.{name}: a list cannot vary as a whole; expected one entry, for example "{name}[0]"')
-    if entry is not None and not parameter.listed:
-        raise InputError(f"{where}.{name}: {base} is not a list; expected {base}")
-    return replace(parameter, name=name, listed=False, broadcast=False)
+    if axes:
+        check_total(math.prod(lengths.values()))
+    return tuple(varying), bool(points)
 
 
 def unknown_parameter(system: type[System], name: str) -> str:

@@ -14,7 +14,6 @@ from drivetrain_jax._machine import in_double_precision
 from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request
 from drivetrain_jax.analysis.atlas import SOLVES
 from drivetrain_jax.atlas import (
-    Atlas,
     StabilityAtlas,
     floquet_atlas,
     floquet_domain,
@@ -53,23 +52,19 @@ class ThroughAtlas(Route):
     ) -> dict[str, str | int]:
         """Fill all points; nothing is reused, because evaluating is faster than reading."""
         solves = Progress(0, kind="direct solves for the atlas")
-        # In parallel with the solves.
+        scene, prepared = job.scene, None
         with ThreadPoolExecutor(1, initializer=in_double_precision) as aside:
-            prepared = aside.submit(self._prepare_judging, job)
-            atlas, first = build_atlas(job.scene, self._ranges, work, solves, self._max_solves)
+            if job.grid.size >= _LARGE:
+                # Some cells need the kernel that decides single ones, which takes seconds to compile.
+                rest = fixed_of(scene, self._ranges), scene.request.options["rtol"], scene.request.outputs
+                prepared = aside.submit(prepare_judging, scene.system, self._ranges, *rest)
+            atlas, first = build_atlas(scene, self._ranges, work, solves, self._max_solves)
             progress.note = solves.note
             uncovered = evaluate(job, buffer, atlas, work, progress, first)
-            prepared.result()
+            if prepared:
+                prepared.result()
         panels = len(atlas.atlas.panels)
         return {"atlas_solves": atlas.atlas.solves, "atlas_panels": panels, "atlas_uncovered": uncovered}
-
-    def _prepare_judging(self, job: Job) -> None:
-        """Compile the kernel that decides single cells, which takes seconds: some cells of a large grid need it."""
-        if job.grid.size < _LARGE:
-            return
-        scene = job.scene
-        fixed, rtol = fixed_of(scene, self._ranges), scene.request.options["rtol"]
-        prepare_judging(scene.system, self._ranges, fixed, rtol, scene.request.outputs)
 
 
 def evaluate(
@@ -99,7 +94,7 @@ def evaluate(
         work.report(progress)
     rest = np.concatenate([np.empty(0, int), *uncovered])
     if rest.size and solve:
-        work.do(job, buffer, progress, first, np.sort(rest))
+        work.do(job, buffer.fill, progress, first, np.sort(rest))
     return rest.size
 
 
@@ -120,7 +115,10 @@ def _points(job: Job, atlas: StabilityAtlas, buffer: ResultBuffer) -> Iterator[t
 def _blocks(job: Job, atlas: StabilityAtlas, buffer: ResultBuffer) -> Iterator[tuple[tuple[slice, ...], Arrays]]:
     """Yield positions in the grid block by block, and the filled arrays of ``buffer`` there."""
     axes = {axis.name: axis.values for axis in job.grid.axes}
-    atlas = atlas.slice({name: float(axes[name][0]) for name in _single(axes, atlas.atlas.parameters)})
+    # Parameters of one value are fixed; at least two others remain.
+    single = [name for name in atlas.atlas.parameters if len(axes[name]) == 1]
+    single = single[: max(len(atlas.atlas.parameters) - 2, 0)]
+    atlas = atlas.slice({name: float(axes[name][0]) for name in single})
     lengths = {name: len(axes[name]) for name in atlas.atlas.parameters}
     longest = sorted(lengths, key=lambda name: lengths[name])[-2:]
     # The longest axes come last, as rows and columns of tiles. Axes of equal length keep their order.
@@ -135,12 +133,6 @@ def _blocks(job: Job, atlas: StabilityAtlas, buffer: ResultBuffer) -> Iterator[t
         places = {n: _in_atlas_order(a, names, tuple(axes)) for n, a in arrays.items()}
         atlas.on_grid(values, outputs, places, rows=sizes[-2] if len(sizes) > 1 else None)
         yield place, arrays
-
-
-def _single(axes: Mapping[str, np.ndarray], parameters: Sequence[str]) -> list[str]:
-    """The parameters that have one value; at least two others remain."""
-    single = [name for name in parameters if len(axes[name]) == 1]
-    return single[: max(len(parameters) - 2, 0)]
 
 
 def _boxes(sizes: tuple[int, ...]) -> Shards:
@@ -188,24 +180,22 @@ def build_atlas(
     def solve(points: np.ndarray) -> np.ndarray:
         nonlocal first
         job = Job(_solves(scene, fixed, tuple(ranges), points, options), DIRECT, full_size=True)
-        answers = _Answers(len(points), width)
+        answers = np.full((len(points), width), np.nan)
+
+        def fill(numbers: np.ndarray, results: Arrays) -> None:
+            answers[numbers] = np.concatenate([results[name] for name in SOLVES.default_outputs], axis=1)
+
         progress.total += len(points)
-        work.do(job, answers, progress, first)
+        work.do(job, fill, progress, first)
         first += job.boxes.count
-        return answers.values
+        return answers
 
     atlas = floquet_atlas(scene.system, ranges, fixed, tolerance, solve, max_solves or MAX_SOLVES)
-    progress.note = _note(atlas)
+    if atlas.gaps:
+        have = f"{counted(len(atlas.panels), 'panel', 'panels')} and {counted(len(atlas.gaps), 'gap', 'gaps')}"
+        reasons = "; ".join(sorted({gap.reason for gap in atlas.gaps}))
+        progress.note = f"the atlas has {have} ({reasons}): what lies in a gap is solved directly"
     return stability_atlas(atlas, scene.system, rtol), first
-
-
-def _note(atlas: Atlas) -> str:
-    """The note about the gaps of ``atlas`` for the user."""
-    if not atlas.gaps:
-        return ""
-    have = f"{counted(len(atlas.panels), 'panel', 'panels')} and {counted(len(atlas.gaps), 'gap', 'gaps')}"
-    reasons = "; ".join(sorted({gap.reason for gap in atlas.gaps}))
-    return f"the atlas has {have} ({reasons}): what lies in a gap is solved directly"
 
 
 def node_job(scene: Scene, ranges: Mapping[str, tuple[float, float]], count: int) -> Job:
@@ -245,13 +235,3 @@ class Nodes(Problem):
     def find_analysis(name: str) -> Analysis:
         """The analysis of the propagator."""
         return SOLVES
-
-
-class _Answers:
-    """The results of some points, ``(N, m)``, NaN for unsolved points."""
-
-    def __init__(self, count: int, width: int) -> None:
-        self.values = np.full((count, width), np.nan)
-
-    def fill(self, points: np.ndarray, results: Mapping[str, np.ndarray]) -> None:
-        self.values[points] = np.concatenate([results[name] for name in SOLVES.default_outputs], axis=1)

@@ -12,11 +12,10 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import chain, islice
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -170,10 +169,8 @@ def run_threads(
             threads.cache_clear()
 
 
-@lru_cache(maxsize=1)
-def _first(job: Job) -> Job:
-    """The first of equal jobs that this worker has received; it holds the compiled kernels."""
-    return job
+# The job of this worker, the first of equal ones, by its digest: it holds the compiled kernels.
+_JOBS: dict[str, Job] = {}
 
 
 def compute(job: Job, store: BlockStore | None, digest: str, block: Block, number: int) -> Arrays:
@@ -183,7 +180,9 @@ def compute(job: Job, store: BlockStore | None, digest: str, block: Block, numbe
     """
     if job.digest != digest:
         raise ChunkError("code, versions or instruction set differ from those of the run")
-    results = _first(job).compute_block(block)
+    if digest not in _JOBS:
+        _JOBS.clear()
+    results = _JOBS.setdefault(digest, job).compute_block(block)
     if store is None:
         return results
     try:
@@ -319,10 +318,7 @@ def _distributed() -> Any:
 
 
 def make_executor(threads: int | None = None, workers: int | None = None, dask: str | None = None) -> Threads:
-    """The executor: Dask at ``dask`` (``tcp://host:port`` or ``local:N``), ``workers`` for ``local:N``, or ``threads``.
-
-    Raises :class:`InputError` for invalid or conflicting settings.
-    """
+    """The executor: Dask at ``dask`` (``tcp://host:port`` or ``local:N``), ``workers`` for ``local:N``, or ``threads``."""
     settings = {"threads": threads, "workers": workers, "dask": dask}
     named = {name: value for name, value in settings.items() if value is not None}
     for name, value in named.items():
@@ -337,11 +333,8 @@ def make_executor(threads: int | None = None, workers: int | None = None, dask: 
     return Cluster(dask or f"local:{workers}") if workers or dask else Threads(threads)
 
 
-class Receiver(Protocol):
-    """Receives results: the buffer of a scene, or a collector of solves."""
-
-    def fill(self, points: np.ndarray, results: Arrays) -> None:
-        """Write the results of ``points``."""
+# Receives the results of points.
+Receive = Callable[[np.ndarray, Arrays], None]
 
 
 class Work:
@@ -360,11 +353,11 @@ class Work:
         return round(time.monotonic() - self._begin, 3)
 
     def do(
-        self, job: Job, receiver: Receiver | None, progress: Progress, first: int = 0, points: np.ndarray | None = None
+        self, job: Job, receive: Receive | None, progress: Progress, first: int = 0, points: np.ndarray | None = None
     ) -> None:
-        """Compute or reuse all blocks of ``job``, or of some of its ``points``, and hand their results to ``receiver``.
+        """Compute or reuse all blocks of ``job``, or of some of its ``points``, and hand their results to ``receive``.
 
-        Without a receiver they are only stored. Numbers in the store start at ``first``.
+        Without it they are only stored. Numbers in the store start at ``first``.
         """
         done, length, left = set[int](), job.grid.path_length, job.grid.size if points is None else len(points)
 
@@ -379,8 +372,8 @@ class Work:
         for block, results in stored():
             done.add(block.number)
             left -= len(results[OUTCOME.name])
-            if receiver is not None:
-                receiver.fill(job.points(block), results)
+            if receive is not None:
+                receive(job.points(block), results)
             progress.reused += results[OUTCOME.name].size
             progress.count(results[OUTCOME.name])
         progress.cost, progress.total_cost, computed = 0.0, float(left * length), 0
@@ -390,7 +383,7 @@ class Work:
             # Closed on exit: after an interrupt nothing further starts.
             with closing(self.executor.run(job, missing, self.store, first, tick)) as finished:
                 for block, results in finished:
-                    outcome = self._received(job, block, results, first, receiver)[OUTCOME.name]
+                    outcome = self._received(job, block, results, first, receive)[OUTCOME.name]
                     done.add(block.number)
                     progress.count(outcome)
                     progress.computed += outcome.size
@@ -408,23 +401,21 @@ class Work:
             self.report(progress)
             raise
 
-    def _received(
-        self, job: Job, block: Block, results: Arrays | None, first: int, receiver: Receiver | None
-    ) -> Arrays:
-        """The results of a computed block, handed to ``receiver``; those of a lost one have no values."""
+    def _received(self, job: Job, block: Block, results: Arrays | None, first: int, receive: Receive | None) -> Arrays:
+        """The results of a computed block, handed to ``receive``; those of a lost one have no values."""
         if results is None:
             results = job.joined(block, (), ())
             results[OUTCOME.name][...] = Outcome.LOST
             if self.store is not None:
                 self.store.write(first + block.number, results)
-        if receiver is not None:
+        if receive is not None:
             if len(results) == 1 and self.store is not None:
                 # A worker has stored the block.
                 results = self.store.read(first + block.number)
                 if results is None:
                     where = f"every worker must see the folder {self.store.place!r}"
                     raise RetryableError(f"block {block.number} is missing after a worker has stored it; {where}")
-            receiver.fill(job.points(block), results)
+            receive(job.points(block), results)
         return results
 
 
@@ -444,7 +435,7 @@ class Route:
             buffer.fill(points, results)
             progress.reused += results[OUTCOME.name].size
             progress.count(results[OUTCOME.name])
-        work.do(job, buffer, progress, points=reused.others(job.grid.size))
+        work.do(job, buffer.fill, progress, points=reused.others(job.grid.size))
         return reused.attrs
 
     def in_memory(self, job: Job, work: Work, progress: Progress) -> Labelled:

@@ -87,10 +87,7 @@ def checksums(file: h5py.File) -> dict[str, str]:
 
 
 def damaged(path: Path) -> list[str] | None:
-    """Names of the damaged variables (``/``: attributes) of the result at ``path``; None if it has no checksums.
-
-    Raises :class:`InputError` if the file cannot be read.
-    """
+    """Names of the damaged variables (``/``: attributes) of the result at ``path``; None if it has no checksums."""
     with opened(path) as file:
         stored = file.attrs.get(ATTRIBUTE)
         if stored is None:

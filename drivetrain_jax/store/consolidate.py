@@ -305,10 +305,7 @@ def release(arrays: Iterable[np.ndarray]) -> None:
 
 
 def attributes(path: Path) -> dict[str, Any]:
-    """The global attributes of the result at ``path`` with its details as texts and numbers.
-
-    Raises :class:`InputError` if the file is not readable.
-    """
+    """The global attributes of the result at ``path`` with its details as texts and numbers."""
     with opened(path) as file:
         # Older files have no group of details.
         details = file[GROUP].attrs.items() if GROUP in file else ()
@@ -321,17 +318,8 @@ def damage(path: Path) -> str:
     return "its checksums are gone" if changed is None else checksums.named(changed)
 
 
-def layout(path: Path) -> dict[str, tuple[np.dtype, tuple[int, ...]]]:
-    """Types and shapes of all variables of the result at ``path``."""
-    with opened(path) as file:
-        return {name: (data.dtype, data.shape) for name, data in file.items() if isinstance(data, h5py.Dataset)}
-
-
 def map_variable(path: Path, name: str) -> np.ndarray:
-    """One variable of the result at ``path``, as a memory map where its storage allows that.
-
-    Raises :class:`InputError` if it cannot be read.
-    """
+    """One variable of the result at ``path``, as a memory map where its storage allows that."""
     with opened(path) as file:
         variable = file[name]
         if not isinstance(variable, h5py.Dataset):
@@ -344,10 +332,7 @@ def map_variable(path: Path, name: str) -> np.ndarray:
 
 
 def read_plain(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """All variables and global attributes of the result at ``path`` as this package wrote them, without xarray.
-
-    Raises :class:`InputError` if the file is not readable.
-    """
+    """All variables and global attributes of the result at ``path`` as this package wrote them, without xarray."""
     with opened(path) as file:
         variables = {name: data for name, data in file.items() if isinstance(data, h5py.Dataset)}
         strings = {name for name, data in variables.items() if h5py.check_string_dtype(data.dtype)}

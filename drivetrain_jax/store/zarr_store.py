@@ -20,7 +20,7 @@ import numpy as np
 
 from drivetrain_jax._errors import InputError, counted
 from drivetrain_jax.store.consolidate import DETAILS, GROUP, Labelled
-from drivetrain_jax.store.files import digest, flush, source_digest, sync_folder
+from drivetrain_jax.store.files import digest, source_digest
 from drivetrain_jax.store.parts import Place, Shards
 
 # Folder among the parts in which a store grows, and the one for a store while another one replaces it.
@@ -86,26 +86,11 @@ def layout(path: Path) -> dict[str, tuple[np.dtype, tuple[int, ...]]]:
 
 
 def write(path: Path, place: Place, arrays: Mapping[str, np.ndarray], shard: int) -> None:
-    """Write the results of number ``shard``, and mark it done after its results are flushed to disk."""
+    """Write the results of number ``shard``, then its checksum, which marks it as done if the results agree."""
     root = _root(path, "r+")
     for name, values in arrays.items():
         root[name][(*place, ...)] = values
-        first = [part.start // length for part, length in zip(place, root[name].chunks, strict=False)]
-        _flush_chunk(path, root[name], (*first, *[0] * (root[name].ndim - len(first))))
     root[_OF_SHARDS][shard] = _checksum(arrays)
-    _flush_chunk(path, root[_OF_SHARDS], (shard,))
-
-
-def _flush_chunk(path: Path, array: Any, index: tuple[int, ...]) -> None:
-    """Flush the file of a chunk, if it has one, and the folders above it up to the store."""
-    file = path / array.path / array.metadata.encode_chunk_key(index)
-    if file.exists():
-        flush(file)
-    for folder in file.parents:
-        if folder.exists():
-            sync_folder(folder)
-        if folder == path:
-            return
 
 
 def done(path: Path) -> np.ndarray:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from drivetrain_jax._errors import InputError, shown
+from drivetrain_jax._errors import InputError, nearest, shown
 from drivetrain_jax._plugins import SYSTEMS, load_plugin, plugin_names
 from drivetrain_jax._quantities import Component, Dimension, Parameter, Variable
 from drivetrain_jax.resonances import Family, Resonances
@@ -113,13 +113,12 @@ def register(system: type[System]) -> type[System]:
 
 
 def get_system(name: str) -> type[System]:
-    """The system ``name``; ``KeyError`` with the known names if there is none, ``ImportError`` if its package fails."""
+    """The system ``name``; :class:`InputError` with the known names if there is none, or if its package fails."""
     if name in _REGISTERED:
         return _REGISTERED[name]
     if name in _BUILT_IN:
         return getattr(import_module(f"drivetrain_jax.systems.{name}"), _BUILT_IN[name])
     system = load_plugin(SYSTEMS, name, "a system", lambda x: isinstance(x, type) and issubclass(x, System))
     if system is None:
-        allowed = ", ".join(system_names())
-        raise KeyError(f"system = {name!r}: expected one of {allowed}, or one given to drivetrain_jax.register")
+        raise InputError(f"system = {name!r}: unknown{nearest(str(name), system_names())}")
     return system

@@ -34,10 +34,7 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
     if analysis == "atlas":
         drawn = "what its `grid` and `drivetrain plot` make of it"
         raise InputError(f"analysis = 'atlas': is a function; expected {drawn}")
-    try:
-        plugin = None if analysis in BUILT_IN else load_plugin(FIGURES, analysis, "a function")
-    except ImportError as error:
-        raise InputError(f"analysis = {analysis!r}: {' '.join(str(error).split())}") from error
+    plugin = None if analysis in BUILT_IN else load_plugin(FIGURES, analysis, "a function")
     record = BUILT_IN.get(analysis, Declared())
     if others and plugin is None and not record.overlaid:
         allowed = ", ".join(name for name, other in BUILT_IN.items() if other.overlaid)

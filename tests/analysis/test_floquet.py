@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import mathieu_a, mathieu_b
 
 import drivetrain_jax as dt
+from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.systems import get_system, system_names
 from tests.oracles.cardan_reference import monodromy, spectral_radius, stacked_monodromy
@@ -428,7 +429,7 @@ def other_package(tmp_path_factory):
 def test_other_package_adds_a_system(other_package):
     assert other_package in system_names()
     assert get_system(other_package).title == "Damped Mathieu equation"
-    with pytest.raises(KeyError, match=r"cardan, .*mathieu"):
+    with pytest.raises(InputError, match=r"cardan, .*mathieu"):
         get_system("nothing of the kind")
 
 

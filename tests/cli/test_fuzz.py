@@ -182,7 +182,7 @@ def test_a_grid_of_many_points_is_refused_with_count_and_limit(folder, capsys):
 
 
 def test_axis_larger_than_memory_is_refused_before_it_is_made(folder, capsys, monkeypatch):
-    monkeypatch.setattr("drivetrain_jax.runs.scene.physical_memory", lambda: 1e9)
+    monkeypatch.setattr("drivetrain_jax.runs.axes.physical_memory", lambda: 1e9)
     Path("scene.toml").write_text(toml.write(GOOD | {"axes": {"a": {"start": 0.0, "stop": 10.0, "num": 10**9}}}))
     code, err = judge(folder, capsys, "run", "scene.toml", "--out", "r.nc")
     assert code == 2

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
-from drivetrain_jax.runs import scene as scenes
+from drivetrain_jax import systems
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System, parameter, serves
 from tests.atlases import atlas_file
 
@@ -71,8 +71,8 @@ class Mathieu(System):
 def atlases(tmp_path_factory):
     """A function of a name of `SCENES`: the atlas, computed once. Files stand in ``folder`` under their names."""
     found, folder = {}, tmp_path_factory.mktemp("atlases")
-    patch, original = pytest.MonkeyPatch(), scenes.get_system
-    patch.setattr(scenes, "get_system", lambda name: Mathieu if name == "mathieu" else original(name))
+    patch = pytest.MonkeyPatch()
+    patch.setitem(systems._REGISTERED, "mathieu", Mathieu)
 
     def atlas(name: str):
         if name not in found:

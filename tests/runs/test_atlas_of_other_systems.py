@@ -11,9 +11,9 @@ import pytest
 import xarray as xr
 
 import drivetrain_jax as dt
+from drivetrain_jax import systems
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.runs import resolve as resolve_module
-from drivetrain_jax.runs import scene
 from drivetrain_jax.runs.resolve import choose_atlas
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System, parameter, serves
@@ -52,8 +52,7 @@ SCENE = {
 @pytest.fixture(scope="module", autouse=True)
 def registered():
     with pytest.MonkeyPatch.context() as patch:
-        original = scene.get_system
-        patch.setattr(scene, "get_system", lambda name: Pendulum if name == "pendulum" else original(name))
+        patch.setitem(systems._REGISTERED, "pendulum", Pendulum)
         yield
 
 

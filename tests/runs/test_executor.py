@@ -181,9 +181,9 @@ def test_a_class_of_a_session_is_refused_before_workers_start(monkeypatch):
 
 def test_a_worker_imports_the_module_of_a_registered_class(grid_scene, monkeypatch):
     """The class is registered in a worker as it is in the driver."""
+    own = load_scene(grid_scene).system
     monkeypatch.setattr("drivetrain_jax.systems._REGISTERED", {})
     monkeypatch.setattr("drivetrain_jax.systems.system_names", lambda: ("cardan",))
-    own = load_scene(grid_scene).system
     dt.register(own)
     sent = pickle.dumps(resolve(load_scene(grid_scene)))
     systems._REGISTERED.clear()

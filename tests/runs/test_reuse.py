@@ -375,39 +375,6 @@ def test_damaged_values_do_not_enter_another_result(tmp_path):
         run_to_file(LARGE, tmp_path / "new.nc", reuse=[path])
 
 
-def _without_values(file):
-    del file["value"]
-
-
-def _of_other_shape(file):
-    del file["outcome"]
-    file.create_dataset("outcome", data=np.zeros((2, 2), np.int8))
-
-
-def _of_words(file):
-    del file["wave"]
-    file.create_dataset("wave", data=["a"] * 5)
-
-
-@pytest.mark.parametrize("change", [_without_values, _of_other_shape, _of_words])
-def test_content_with_valid_checksums_that_is_no_result_is_refused(tmp_path, change):
-    path = tmp_path / "r.nc"
-    run_to_file(SMALL, path)
-    with h5py.File(path, "r+") as file:
-        change(file)
-        checksums.seal(file)
-    with pytest.raises(InputError, match=r"reuse = .*: damaged \((value|outcome|wave)\)"):
-        run_to_file(LARGE, tmp_path / "new.nc", reuse=[path])
-    for scene_there in (SMALL, LARGE):
-        with pytest.raises(InputError, match=r"holds a damaged result \((value|outcome|wave)\); --fresh"):
-            run_to_file(scene_there, path)
-        assert status(scene_there, path).state == "stale"
-    if change is not _without_values:
-        for read in (dt.open_result, dt.plot):
-            with pytest.raises(InputError, match="not a result of drivetrain_jax"):
-                read(path)
-
-
 def test_damage_during_an_interrupted_growth_is_named(tmp_path):
     path = tmp_path / "r.nc"
     run_to_file(SMALL, path)

@@ -375,23 +375,6 @@ def test_a_link_stays_a_link_and_has_the_lock_of_its_file(grid_scene, tmp_path):
     assert link.is_symlink() and os.listdir(tmp_path / "data") == ["r.nc"]
 
 
-@pytest.mark.parametrize(
-    "other", [{}, {"value": np.zeros(2)}, {"value": np.zeros((16, 2)), "outcome": np.zeros(16, np.int8)}]
-)
-def test_a_whole_block_of_other_content_is_computed_again(tmp_path, other):
-    path, axes = tmp_path / "r.nc", {"b": {"values": [1.0, 3.0]}, "a": {"start": 0.0, "stop": 4.0, "num": 16}}
-    scene = {"system": "toy", "analysis": "toy", "outputs": ["value"], "axes": axes}
-    with pytest.raises(KeyboardInterrupt):
-        run_to_file(scene, path, executor=Threads(1), report=stop_after(1))
-    blocks = PartsFolder(path)
-    for number in blocks.numbers():
-        next(Path(f"{path}.parts").glob(f"{number:08d}-*")).unlink()
-        blocks.write(number, other)
-    assert status(scene, path).done == 0
-    assert run_to_file(scene, path).computed == 32
-    assert_same(dt.open_result(path), dt.run(scene))
-
-
 def test_a_damaged_block_is_computed_again(grid_scene, tmp_path):
     path = tmp_path / "r.nc"
     with pytest.raises(KeyboardInterrupt) as stopped:
@@ -432,7 +415,7 @@ def test_wrong_results_of_an_analysis_are_one_line(monkeypatch, found, dim, mess
     solvers, labels = (Solver("fixed", lambda *_: found),), (Dimension(dim, "part of the wave", (1, 2, 3)),)
     wrong = replace(toy.ANALYSES["toy"], solvers=lambda *_: solvers, dimensions=lambda *_: labels)
     monkeypatch.setitem(toy.ANALYSES, "toy", wrong)
-    monkeypatch.setattr("drivetrain_jax.analyses.get_analysis", lambda _: wrong)
+    monkeypatch.setattr("drivetrain_jax.analysis.get_analysis", lambda _: wrong)
     with pytest.raises((Incomplete, dt.InputError)) as raised:
         if into == "scene":
             dt.run({"system": "toy", "analysis": "toy", "outputs": ["wave"], "fixed": {"a": 1.0}})

@@ -141,7 +141,7 @@ WRONG = {
     "unknown key": (changed(axis={}), "axis", "axes"),
     "missing system": ({"analysis": "toy"}, "system", "missing required field"),
     "unknown system": (changed(system="tooy"), "tooy", "cardan"),
-    "unknown analysis": (changed(analysis="ty"), "ty", "expected for toy one of toy, slow"),
+    "unknown analysis": (changed(analysis="ty"), "ty", "unknown to toy (did you mean toy?); expected one of toy, slow"),
     "analysis of another system": (changed(system="cardan", analysis="toy"), "toy", "floquet"),
     "wrong type of a key": (changed(title=3), "title = 3", "expected `str`"),
     "wrong type of outputs": (changed(outputs=3), "outputs = 3", "expected `array | null`"),

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from drivetrain_jax import analysis, systems
 from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analysis import RTOL, Analysis, Outcome, Solver
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
@@ -192,14 +193,12 @@ ANALYSES = {
 }
 
 
-def _find(registry: dict, original):
-    return lambda name: registry[name] if name in registry else original(name)
-
-
 def names(replace=setattr) -> None:
     """Make the toys known to scenes; ``replace`` may be ``monkeypatch.setattr``."""
-    replace(scene, "get_system", _find({"toy": Toy}, scene.get_system))
-    replace(scene, "get_analysis", _find(ANALYSES, scene.get_analysis))
+    replace(systems, "_REGISTERED", {**systems._REGISTERED, "toy": Toy})
+    known = analysis.get_analysis
+    for module in (analysis, scene):
+        replace(module, "get_analysis", lambda name: ANALYSES[name] if name in ANALYSES else known(name))
 
 
 def small_blocks(replace=setattr) -> None:

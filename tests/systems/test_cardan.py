@@ -12,6 +12,7 @@ import pytest
 from mpmath import mp
 from scipy.integrate import quad
 
+from drivetrain_jax import InputError
 from drivetrain_jax.analysis.floquet import propagator
 from drivetrain_jax.resonances import natural_frequencies
 from drivetrain_jax.systems import cardan, get_system, system_names
@@ -301,7 +302,7 @@ def test_systems_are_found_by_name():
     assert system_names()[0] == "cardan"
     assert SYSTEM.name == "cardan"
     assert set(SYSTEM.models) == {"floquet", "atlas", "forced", "frequency_response", "history", "lyapunov"}
-    with pytest.raises(KeyError, match="expected one of cardan"):
+    with pytest.raises(InputError, match="expected cardan"):
         get_system("cardn")
 
 

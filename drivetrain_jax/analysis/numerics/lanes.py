@@ -249,3 +249,10 @@ def evaluated_once(certain: Array, function: Callable[[], Any]) -> Any:
     """
     shapes = jax.eval_shape(function)
     return lax.cond(certain, function, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
+
+
+def with_lanes(result: Array, dims: int, lanes: int) -> Array:
+    """``result`` with the lanes as last axis, also if it does not depend on the varying parameters."""
+    result = jnp.asarray(result)
+    result = result if result.ndim > dims else result[..., None]
+    return jnp.broadcast_to(result, (*result.shape[:-1], lanes))
