@@ -151,10 +151,14 @@ def test_branch_passes_contacts_that_come_and_go(begin, end):
 
     @quick_jit
     def follow():
-        x = settle(model, basis, jnp.zeros((basis.size, 1)), jnp.array([begin]))
-        return trace(model, basis, hb.balance(model, basis, x, jnp.array([begin])).x, begin, end, jnp.array([0.2]))[0]
+        settled = settle(model, basis, jnp.zeros((basis.size, 1)), jnp.array([begin]))
+        x = hb.balance(model, basis, settled, jnp.array([begin])).x
+        return settled, x, trace(model, basis, x, begin, end, jnp.array([0.2]))[0]
 
-    omega = np.asarray(follow()[:, -1, 0])
+    settled, x, branch = follow()
+    # The transient has decayed to 1e-4; seven harmonics leave 1.6e-3 of the exact motion.
+    assert np.abs(settled - x).max() < 3e-3 * np.linalg.norm(x)
+    omega = np.asarray(branch[:, -1, 0])
     assert ((omega - end) * np.sign(end - begin) >= 0).any()
     np.testing.assert_allclose([np.nanmin(omega), np.nanmax(omega)], [0.05, 0.163], atol=0.02)
 
