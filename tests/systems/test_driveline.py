@@ -209,7 +209,7 @@ def test_half_a_period_is_enough_for_phases_of_a_quarter_turn(gears):
 @cache
 def lagrange_cases() -> list:
     rng = np.random.default_rng(8)
-    sizes = [(3, 1), (4, 2), (3, 2), (5, 3), (4, 3), (5, 1), (8, 3)]
+    sizes = [(3, 1), (4, 2), (3, 2), (5, 3), (4, 3), (5, 1), (8, 3), (6, 2), (7, 3), (6, 1)]
     return [random_chain(rng, n, joints, gears=i % 3 == 1) for i, (n, joints) in enumerate(sizes)]
 
 
@@ -247,7 +247,7 @@ def test_derivatives_of_torques_are_those_of_differences(name):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("number", range(7))
+@pytest.mark.parametrize("number", range(10))
 def test_multipliers_are_those_of_lagrange_multipliers(number):
     chain = lagrange_cases()[number]
     found = dt.floquet(dt.Driveline(**chain), outputs=["floquet_multiplier", "floquet_multiplier_error"])
