@@ -85,6 +85,8 @@ class Solver:
     short_loops: bool = False
     #: One point takes as long as a compilation.
     lengthy: bool = False
+    #: So few points are asked for that the compiler would take longer to optimise than all of them to compute.
+    few: bool = False
 
 
 def finite_results(

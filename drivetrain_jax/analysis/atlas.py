@@ -58,6 +58,8 @@ def _propagator_solvers(system: type[System], request: Request) -> tuple[Solver,
         lambda model: whole_span(model.reduced),
         lambda model, phi, _: _results(phi, request.outputs),
         _CHUNK,
+        few=request.method != "direct",
+        small=request.method == "small",
     )
 
 
@@ -75,8 +77,12 @@ SOLVES = Analysis(
     title="Propagator of a linear periodic system, for its atlas",
     variables=_SOLVED,
     default_outputs=(PROPAGATOR, CHANGE),
-    methods={"direct": ("rtol",)},
-    method_titles={"direct": "direct solves of floquet at the nodes of Chebyshev panels"},
+    methods=dict.fromkeys(("direct", "few", "small"), ("rtol",)),
+    method_titles={
+        "direct": "direct solves of floquet at the nodes of Chebyshev panels",
+        "few": "the same at held-out points alone, by a program that is not optimised",
+        "small": "the same by a small program, for cheap points",
+    },
     options=(RTOL,),
     solvers=_propagator_solvers,
     dimensions=lambda *_: (Dimension("entry", "row times size plus column", ()),),

@@ -13,6 +13,7 @@ from drivetrain_jax.atlas.construction import Domain, Function, construct
 from drivetrain_jax.atlas.floquet import (
     floquet_atlas,
     floquet_domain,
+    method_of_solves,
     numbers_per_solve,
     prepare_judging,
     solve_rtol,
@@ -32,6 +33,7 @@ __all__ = [
     "floquet_atlas",
     "floquet_domain",
     "from_arrays",
+    "method_of_solves",
     "numbers_per_solve",
     "prepare_judging",
     "solve_rtol",

@@ -81,12 +81,12 @@ def evaluated_tiles(
     axes: Sequence[np.ndarray],
     names: Sequence[str],
     fixed: Mapping[str, Any],
-    kernel: Callable[[bool], Any],
+    kernels: Sequence[Any],
     rtol: float,
 ) -> Iterator[tuple[Tile, Cells]]:
     """Yield every tile with the results of its cells, ``(R, C)``, in order.
 
-    ``axes`` are the axes of the grid in parameters; ``kernel(dense)`` returns the kernel of :func:`tile_kernel`.
+    ``axes`` are the axes of the grid in parameters; ``kernels`` of :func:`tile_kernel` serve sparse and dense tiles.
     """
 
     constants = {name: jnp.asarray(value) for name, value in fixed.items()}
@@ -98,7 +98,7 @@ def evaluated_tiles(
         values[names[-1]] = filled_up(values[names[-1]], cells.shape[1])
         values[names[-2]] = filled_up(values[names[-2]], len(tile.first))
         factors = (tile.first, tile.columns) if tile.spread is None else (tile.first, tile.columns, tile.spread)
-        cells_of_tile = kernel(tile.spread is not None)(*factors, tile.panel.value_error, values, constants, rtol)
+        cells_of_tile = kernels[tile.spread is not None](*factors, tile.panel.value_error, values, constants, rtol)
         return {name: np.asarray(x)[:rows, :columns] for name, x in cells_of_tile.items()}
 
     return in_threads(tiles, work)

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax._machine import compiling, threads
-from drivetrain_jax.analysis.floquet.effort import stable_steps, steps_needed
+from drivetrain_jax.analysis.floquet.effort import panels_needed, stable_steps, steps_needed
 from drivetrain_jax.analysis.numerics.collocation import propagators_along
 from drivetrain_jax.analysis.numerics.kernels import Words, compiler_options, predicted, split
 from drivetrain_jax.atlas.charts import in_threads
@@ -66,6 +66,16 @@ def numbers_per_solve(
 ) -> int:
     """Number of values per solve for :func:`floquet_atlas`: entries of the propagator, and their errors."""
     return 2 * _form(system, floquet_domain(system, ranges, fixed)).size ** 2
+
+
+def method_of_solves(
+    system: type[System], ranges: Mapping[str, tuple[float, float]], fixed: Mapping[str, Any], tolerance: float
+) -> str:
+    """The method of the solves of an atlas: ``direct`` at nodes; if power series give the nodes, ``few`` or ``small``."""
+    domain = floquet_domain(system, ranges, fixed)
+    if _series_decay(system, domain, tolerance) > _STIFF:
+        return "direct"
+    return "small" if panels_needed(system, _corners(domain), _STEPS_AT).max() <= _CHEAP else "few"
 
 
 def prepare_judging(
@@ -165,21 +175,31 @@ _SHARPER, _MOST_PARTS = 1e-3, 4_000
 # Tolerance below which rounding of the parts shows in their product. Many steps of decay have the same effect, because the
 # product is then small.
 _TOO_FINE, _STIFF = 5e-13, 50
-# Tolerance at which steps are predicted.
-_STEPS_AT = 1e-10
+# Tolerance at which steps are predicted, and the number of panels up to which a small program solves held-out points.
+_STEPS_AT, _CHEAP = 1e-10, 256
 
 Key = tuple[Callable[..., FloquetModel], Series, tuple[str, ...], Words, tuple[tuple[str, tuple[int, ...]], ...]]
 
 
 def series_nodes(system: type[System], domain: Domain, tolerance: float) -> SeriesNodes | None:
     """The source of nodes for ``domain``; None without a series of the system, or if the parts would be too inaccurate."""
+    decay = _series_decay(system, domain, tolerance)
+    # Never None if the decay is finite.
+    return SeriesNodes(system, domain, smoothness(system).series, decay, tolerance) if decay <= _STIFF else None  # pyright: ignore[reportArgumentType]
+
+
+def _series_decay(system: type[System], domain: Domain, tolerance: float) -> float:
+    """Most steps of decay in a domain; infinite without a series along it, or for a tolerance too fine for one."""
     series = smoothness(system).series
     if series is None or series.parameter not in domain.parameters or tolerance < _TOO_FINE:
-        return None
+        return math.inf
+    return float(np.max(predicted(_stable_steps, (system.models["floquet"].build,), _corners(domain))))
+
+
+def _corners(domain: Domain) -> dict[str, Any]:
+    """The parameters at all corners of a domain."""
     corners = np.array(list(itertools.product(*zip(domain.lower, domain.upper, strict=True))))
-    columns = {**domain.fixed, **dict(zip(domain.parameters, corners.T, strict=True))}
-    decay = float(np.max(predicted(_stable_steps, (system.models["floquet"].build,), columns)))
-    return SeriesNodes(system, domain, series, decay, tolerance) if decay <= _STIFF else None
+    return {**domain.fixed, **dict(zip(domain.parameters, corners.T, strict=True))}
 
 
 def _stable_steps(build: Callable[..., FloquetModel], values: Any) -> Array:

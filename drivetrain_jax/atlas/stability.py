@@ -179,14 +179,16 @@ class StabilityAtlas:
         results[OUTCOME.name][...] = Outcome.LOST
         coordinates = [c.forward(axis) for c, axis in zip(self.atlas.coordinates, axes, strict=True)]
 
-        def kernel(dense: bool) -> Any:
-            kind = "undamped" if undamped else "dense" if dense else "sparse"
-            return self.keep(charts.tile_kernel(self.build, names, kind), compiler_options(), f"tile {names} {kind}")
-
+        kinds = ("undamped",) * 2 if undamped else ("sparse", "dense")
+        # Before the threads start: each of them would compile a kernel of its own.
+        kernels = [
+            self.keep(charts.tile_kernel(self.build, names, kind), compiler_options(), f"tile {names} {kind}")
+            for kind in kinds
+        ]
         cut = tiles(self.atlas, coordinates, (charts.ROWS, charts.COLUMNS), rows=rows, dense=not undamped)
         again = [
             _store(results, tile, cells)
-            for tile, cells in charts.evaluated_tiles(cut, axes, names, self.atlas.fixed, kernel, self.rtol)
+            for tile, cells in charts.evaluated_tiles(cut, axes, names, self.atlas.fixed, kernels, self.rtol)
         ]
         unsure = np.concatenate([np.empty((0, len(axes)), int), *again])
         for part in (unsure[i : i + (1 << 18)] for i in range(0, len(unsure), 1 << 18)):

@@ -146,7 +146,7 @@ class Job:
         with self._lock:
             for index, size in {(chunk.solver, chunk.size): None for chunk in chunks}.keys() - self._kernels.keys():
                 solver, pool = self.solvers[index], threads(_SIDE_BY_SIDE, "compile")
-                few = self._few and not solver.lengthy
+                few = solver.few or (self._few and not solver.lengthy)
                 self._kernels[index, size] = pool.submit(kernel_of, self.problem, self.grid, solver, size, few)
 
     def compute(self, chunk: Chunk) -> Arrays:

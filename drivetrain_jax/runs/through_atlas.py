@@ -17,6 +17,7 @@ from drivetrain_jax.atlas import (
     StabilityAtlas,
     floquet_atlas,
     floquet_domain,
+    method_of_solves,
     numbers_per_solve,
     prepare_judging,
     solve_rtol,
@@ -24,7 +25,7 @@ from drivetrain_jax.atlas import (
 )
 from drivetrain_jax.atlas.construction import MAX_SOLVES
 from drivetrain_jax.runs.assemble import ResultBuffer
-from drivetrain_jax.runs.axes import Axis
+from drivetrain_jax.runs.axes import Axis, Grid
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.reuse import ReusedPoints
 from drivetrain_jax.runs.scene import Problem, Ranges, Scene
@@ -173,13 +174,13 @@ def build_atlas(
     fixed = fixed_of(scene, ranges)
     rtol = scene.request.options["rtol"]
     tolerance = _tolerance(scene)
-    options = {"rtol": solve_rtol(tolerance)}
+    options, method = {"rtol": solve_rtol(tolerance)}, method_of_solves(scene.system, ranges, fixed, tolerance)
     width = numbers_per_solve(scene.system, ranges, fixed)
     first = 0
 
     def solve(points: np.ndarray) -> np.ndarray:
         nonlocal first
-        job = Job(_solves(scene, fixed, tuple(ranges), points, options), DIRECT, full_size=True)
+        job = Job(_solves(scene, fixed, tuple(ranges), points, method, options), DIRECT, full_size=True)
         answers = np.full((len(points), width), np.nan)
 
         def fill(numbers: np.ndarray, results: Arrays) -> None:
@@ -205,7 +206,7 @@ def node_job(scene: Scene, ranges: Mapping[str, tuple[float, float]], count: int
     spread = np.cos(np.pi * np.random.default_rng(0).random((count, len(ranges))))
     points = domain.points(domain.box().place(spread))
     options = {"rtol": solve_rtol(_tolerance(scene))}
-    return Job(_solves(scene, fixed, tuple(ranges), points, options), DIRECT, full_size=True)
+    return Job(_solves(scene, fixed, tuple(ranges), points, "direct", options), DIRECT, full_size=True)
 
 
 def _tolerance(scene: Scene) -> float:
@@ -219,13 +220,16 @@ def fixed_of(scene: Scene, ranges: Mapping[str, tuple[float, float]]) -> dict[st
     return {name: fixed[name] for name in scene.system.models[SOLVES.name].parameters if name in fixed}
 
 
-def _solves(scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.ndarray, options: Mapping) -> Nodes:
+def _solves(
+    scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.ndarray, method: str, options: Mapping
+) -> Nodes:
     """The direct solves of some points."""
-    axes = tuple(
-        Axis(name, scene.system.parameter(name), None, column) for name, column in zip(names, points.T, strict=True)
-    )
-    request = Request(SOLVES.default_outputs, next(iter(SOLVES.methods)), dict(options))
-    return Nodes(scene.system, SOLVES, request, axes, True, fixed)
+    request = Request(SOLVES.default_outputs, method, dict(options))
+    nodes = Nodes(scene.system, SOLVES, request, (), True, fixed)
+    # Fixed numbers as columns: jax traces a march twice if some of its parameters are the same for all lanes.
+    columns = {name: np.full(len(points), value) for name, value in Grid.of(nodes).numbers.items()}
+    columns |= dict(zip(names, points.T, strict=True))
+    return replace(nodes, axes=tuple(Axis(n, scene.system.parameter(n), None, x) for n, x in columns.items()))
 
 
 class Nodes(Problem):

@@ -192,12 +192,14 @@ class _Lines:
             steep = 1 + 6 / low[0] + 6 / high[0] + 8 / left[0] + 8 / right[0]
         return np.where(np.isfinite(norm), norm, np.inf), steep
 
-    def errors(self, roundings: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Truncation errors of the parts, their rounding errors, both as Frobenius norms in balanced coordinates, and
-        bounds of the norms of their exponents."""
+    def errors(self, roundings: int) -> tuple[np.ndarray, np.ndarray]:
+        """Truncation errors of the parts and their rounding errors, both as Frobenius norms in balanced coordinates;
+        infinite if the norm of an exponent is not below ``_SHORT``."""
         sums = _tables()[2]
         norm, steep = self.rates()
         x = self.largest * self.half * norm
+        if x.max() >= _SHORT:
+            return np.full_like(x, np.inf), x
         powers = [sums[k] * x**k for k in range(_TERMS + 1)]
         left_out = np.full_like(x, np.inf)
         for radius in _ELLIPSES:
@@ -212,7 +214,7 @@ class _Lines:
         rounded = 2 * step * sum(k * power for k, power in enumerate(powers)) + 2 * rounding(4 * _TERMS + 4) * sum(
             powers
         )
-        return left_out + tail, rounded, x
+        return left_out + tail, rounded
 
 
 # Infinite bounds lead to NaN, which decides nothing.
@@ -237,8 +239,8 @@ def propagators(
     largest, count = float(s.max()), 8
     while True:
         lines = _Lines(c, values, largest, count)
-        left_out, rounded, x = lines.errors(roundings)
-        if left_out.max() < _SMALL and x.max() < _SHORT:
+        left_out, rounded = lines.errors(roundings)
+        if left_out.max() < _SMALL:
             break
         if count > _MOST_PARTS:
             shape = len(s), len(c)

@@ -54,11 +54,14 @@ def direct_solvers(
     results: Results,
     chunk: int = 512,
     damped: bool = False,
+    few: bool = False,
+    small: bool = False,
 ) -> tuple[Solver, ...]:
     """The solvers that return ``results(model, monodromy, factors)`` from the monodromy matrix of ``form(model)``.
 
     ``rtol`` predicts the effort; every point is refined to the error ``target``. With ``damped`` a second solver takes the
-    points with strong damping, in the model's form for them.
+    points with strong damping, in the model's form for them. For ``few`` points the program is not optimised. A
+    ``small`` one compiles even sooner, and takes ten times as long to compute.
     """
     build = system.models["floquet"].build
 
@@ -71,7 +74,7 @@ def direct_solvers(
             ratio = jnp.where(target <= _FINE, _RATIO, 2) if model.panels is not None else 2
 
             def one(point: Mapping[str, Any], panels: Array) -> Monodromy:
-                return monodromy(form(build(point)), panels, target, ratio, lanes)
+                return monodromy(form(build(point)), panels, target, ratio, lanes, small)
 
             def factors() -> Factored:
                 # Gauss schemes need panels in proportion to fast decays and growths.
@@ -82,7 +85,7 @@ def direct_solvers(
 
         return Solver(
             f"direct: Gauss collocation of order 10{name}", solve, effort, lambda values: traced_panels(build, values, rtol),
-            seconds=1e-6, chunk=chunk, march=True, short_loops=True,
+            seconds=1e-6, chunk=chunk, march=True, short_loops=True, few=few,
         )  # fmt: skip
 
     def effort(columns: Mapping[str, Any], strong: bool) -> np.ndarray:

@@ -201,6 +201,8 @@ class Gauss(diffrax.AbstractSolver):
     ratio: Any = 2
     # Of the batch that the point is expected to be a part of: its trace is that of the batch.
     lanes: int = eqx.field(static=True, default=1)
+    # A small program, whose compilation takes less time and whose panels take more.
+    small: bool = eqx.field(static=True, default=False)
     term_structure: ClassVar = LinearTerm
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
@@ -228,14 +230,19 @@ class Gauss(diffrax.AbstractSolver):
     def solved(self, system: LinearPeriodic) -> tuple[Array, Monodromy]:
         """The propagator over the span, and the monodromy matrix."""
         shared = jnp.asarray(self.panels), jnp.asarray(self.rtol, float), jnp.asarray(self.ratio)
-        return _of_one(_refined, system, shared, self.lanes)
+        return _of_one(_refined_by_small if self.small else _refined, system, shared, self.lanes)
 
 
-def monodromy(system: LinearPeriodic, panels: Array, rtol: Any, ratio: Any = 2, lanes: int = 1) -> Monodromy:
-    """The monodromy matrix of one point of a batch of ``lanes``, from ``panels`` predicted panels on."""
+def monodromy(
+    system: LinearPeriodic, panels: Array, rtol: Any, ratio: Any = 2, lanes: int = 1, small: bool = False
+) -> Monodromy:
+    """The monodromy matrix of one point of a batch of ``lanes``, from ``panels`` predicted panels on.
+
+    ``small``: by a program that compiles sooner and computes longer.
+    """
     end = diffrax.diffeqsolve(
         LinearTerm(system),
-        Gauss(panels, rtol, ratio, lanes),
+        Gauss(panels, rtol, ratio, lanes, small),
         t0=0.0,
         t1=1.0,
         dt0=None,
@@ -278,7 +285,14 @@ def _in_factors(fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array]) 
 
 def _refined(fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array, Array, Array]) -> tuple[Array, Monodromy]:
     """The propagator and the monodromy matrix of all lanes, the last axis of ``arrays``."""
-    return _by_blocks(_agreeing, fixed, arrays, shared, _LONG)
+    return _by_blocks(partial(_agreeing, False), fixed, arrays, shared, _LONG)
+
+
+def _refined_by_small(
+    fixed: Constants, arrays: LinearPeriodic, shared: tuple[Array, Array, Array]
+) -> tuple[Array, Monodromy]:
+    """:func:`_refined` by a small program."""
+    return _by_blocks(partial(_agreeing, True), fixed, arrays, shared, _LONG)
 
 
 def _by_blocks(
@@ -320,6 +334,7 @@ def _by_blocks(
 
 
 def _agreeing(
+    small: bool,
     marches: list[Panels],
     fixed: list[Fixed],
     ends: Array | None,
@@ -335,7 +350,7 @@ def _agreeing(
     def run(count: Array, records: Array) -> Propagator:
         state = _State.start(n, lanes)
         for march, values in zip(marches, fixed, strict=True):
-            state = march.through(values, state, count, records)
+            state = march.through(values, state, count, records, small)
         propagator = state.propagator(len(marches) * count)
         squared = propagator.squared if marches[0].d == n else jnp.maximum(propagator.decay, 0.0) / _STRONG
         return propagator._replace(squared=squared)
@@ -515,18 +530,20 @@ class Panels:
         """The propagator of one of ``count`` panels, ``(n, n, lanes)``, by a small program for ``few`` lanes."""
         h = fixed.span / count
         rows = jnp.where((np.arange(self.size) < self.d)[:, None], 1.0, h * fixed.unit)
-        coefficients = self.coefficients(fixed, h, number)
-        # For few lanes the compiler takes longer than the computation.
-        small = few and not self.chain
-        moved = small_panel(self.scheme, coefficients) if small else panel(self.scheme, coefficients, self.chain)
-        return moved * rows / rows[:, None]
+        return self._panel(self.coefficients(fixed, h, number), few) * rows / rows[:, None]
 
-    def through(self, fixed: Fixed, state: _State, count: Array, records: Array) -> _State:
+    def _panel(self, coefficients: tuple[Array, ...], small: bool) -> Array:
+        """P of one panel, by a ``small`` program where the compiler takes longer than the computation."""
+        if small and not self.chain:
+            return small_panel(self.scheme, coefficients)
+        return panel(self.scheme, coefficients, self.chain)
+
+    def through(self, fixed: Fixed, state: _State, count: Array, records: Array, small: bool = False) -> _State:
         """The state after ``count`` panels; with ``records`` its covariance and stiffness too."""
         h = fixed.span / count
         # The displacements' second state is their change in a panel.
         unit = h * fixed.unit
-        onward = partial(self._onward, fixed, h, records)
+        onward = partial(self._onward, fixed, h, records, small)
         state = jax.lax.fori_loop(0, count, onward, state.scaled_rows(self.d, unit))
         return state.scaled_rows(self.d, 1 / unit)
 
@@ -552,9 +569,9 @@ class Panels:
         masks = np.eye(len(places)).reshape(-1, self.d, self.d, 1)
         return sum(mask * entry[:, None, None] for mask, entry in zip(masks, block, strict=True))  # pyright: ignore[reportReturnType]
 
-    def _onward(self, fixed: Fixed, h: Array, records: Array, number: Array, state: _State) -> _State:
+    def _onward(self, fixed: Fixed, h: Array, records: Array, small: bool, number: Array, state: _State) -> _State:
         coefficients = self.coefficients(fixed, h, number)
-        moved = panel(self.scheme, coefficients, self.chain)
+        moved = self._panel(coefficients, small)
         matrix = stored(matmul)(moved, state.matrix)
         factor = stored(_factor)(matrix)
         matrix = stored(jnp.multiply)(matrix, factor)
