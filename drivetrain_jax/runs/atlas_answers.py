@@ -141,12 +141,12 @@ class AtlasQuery:
         self.checked.append(np.any(flags, axis=0))
         return radius
 
-    def proofs(self) -> list[str]:
-        """The number of checked points whose verdict is proved, as a line; empty without checks."""
-        if not self.checked:
-            return []
-        said = proof.summary(np.concatenate(self.checked), "points checked")
-        return [f"  {said}; between them they hold by estimate" if "proved" in said else f"  {said}"]
+    def proofs(self) -> tuple[list[str], dict[str, int]]:
+        """The number of checked points whose verdict is proved, as a line (none without checks) and as data."""
+        flags = np.concatenate([np.empty(0, bool), *self.checked])
+        said = proof.summary(flags, "points checked")
+        line = f"  {said}; between them they hold by estimate" if "proved" in said else f"  {said}"
+        return [line] * bool(flags.size), {"proved": int(flags.sum()), "points": flags.size}
 
     def numbers(self) -> dict[str, float]:
         """The values that are numbers."""
@@ -398,6 +398,7 @@ def speed_windows(
         lines += [text for text, _ in effects if text]
         sensitivities.append([effect for _, effect in effects])
         lines += [f"    {text}" for text in compared[k]]
+    proofs, proved = asked.proofs()
     data = {
         "question": "speed_windows",
         "parameters": {**atlas.fixed, **asked.values},
@@ -419,10 +420,11 @@ def speed_windows(
             for i, word in zip(answer.unstable, names, strict=True)
         ],
         "undecided": [list(r) for r in answer.undecided],
+        "proofs": proved,
         **forced,
     }
     lines += [] if answer.windows else [f"  none {_OPEN if answer.undecided else 'within the atlas'}"]
-    lines += [*_undecided(asked, speed, answer.undecided), *asked.proofs()]
+    lines += [*_undecided(asked, speed, answer.undecided), *proofs]
     return Reply(lines, data, _where_unstable(asked, part, speed, answer, names))
 
 
@@ -548,7 +550,8 @@ def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: des
     if answer.check:
         lines += [] if answer.certain else ["  not certain: undecided ranges are wider than the errors"]
         lines.append(f"  {_checked(answer.check)}")
-    lines += [*_undecided(asked, name, answer.undecided), *asked.proofs()]
+    proofs, proved = asked.proofs()
+    lines += [*_undecided(asked, name, answer.undecided), *proofs]
     speeds = [] if answer.value is None else [asked.values[asked.atlas.scene.system.roles["speed"]]]
     compared, forced = forced_over(
         asked.atlas, amplitude, speeds, {**asked.numbers(), name: answer.value or 0.0}, asked.named
@@ -570,6 +573,7 @@ def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: des
         ],
         "undecided": [list(r) for r in answer.undecided],
         "check": _check(answer.check),
+        "proofs": proved,
         **forced,
     }
     return Reply(lines, data, _extreme_sentence(safe, asked, answer))

@@ -123,10 +123,10 @@ def test_charts_reports_pages_tips_and_design_say_what_is_proved(path, monkeypat
     assert "drivetrain query says which are proved" in atlas.explore().text
     tips = find_tips(atlas.stability.atlas, atlas.scene.system)
     assert tips.proof == "1 tip is certain within the bounds of the atlas, which are estimates."
-    answer = widest_angle(atlas, {"Omega": (1.3, 1.5)}).text
-    assert re.search(
-        "the verdicts of 1[0-9]+ of 105 points checked are proved; between them they hold by estimate", answer
-    )
+    answer = widest_angle(atlas, {"Omega": (1.3, 1.5)})
+    pattern = "the verdicts of (1[0-9]+) of 105 points checked are proved; between them they hold by estimate"
+    (proved,) = re.findall(pattern, answer.text)
+    assert answer.data["proofs"] == {"proved": int(proved), "points": 105}
     assert "the verdict is proved" in query(atlas, {"beta": 0.3, "Omega": 1.3}).text
 
 
