@@ -16,7 +16,7 @@ import drivetrain_jax as dt
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analysis import Outcome, Request, get_analysis
 from drivetrain_jax.analysis.forced import orbit
-from drivetrain_jax.analysis.forced.analysis import _cubic_root, amplitudes, predicted_steps
+from drivetrain_jax.analysis.forced.analysis import _cubic_root, amplitudes, distinct, predicted_steps
 from drivetrain_jax.analysis.forced.orbit import integrate, shoot
 from drivetrain_jax.systems import ForcedModel, get_system
 from tests.quick_jit import quick_jit
@@ -290,6 +290,12 @@ def test_a_model_of_one_displacement_is_refused():
     model = ForcedModel(lambda t, y: y, lambda t, y: y, 1.0, (0,))
     with pytest.raises(InputError, match=r"^system: its model has 1 displacements; expected 2, as it says$"):
         predicted_steps(lambda columns: model, 4, 2, {"a": np.ones(1)})
+
+
+def test_an_orbit_behind_missing_ones_is_distinct():
+    states = np.full((54, 4), np.nan)
+    states[[2, 12, 13]] = np.array([[0.1], [0.2], [0.1]])
+    assert np.flatnonzero(distinct(jnp.asarray(states), 1e-3)).tolist() == [2, 12]
 
 
 @pytest.mark.full

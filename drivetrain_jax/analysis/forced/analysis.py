@@ -364,8 +364,10 @@ def nonlinear_orbit(
 def distinct(states: Array, near: float) -> Array:
     """Flags of the states (m, n) that are not NaN and not, up to ``near`` times their size, one of those before them."""
     apart = jnp.max(jnp.abs(states[:, None] - states[None]), axis=2)
-    same = jnp.tril(apart <= near * jax.vmap(size_of)(states)[:, None], -1)
-    return jnp.isfinite(states[:, 0]) & ~jnp.any(same, axis=1)
+    exists = jnp.isfinite(states[:, 0])
+    # The largest entry of NaN is -inf on some processors.
+    same = jnp.tril(apart <= near * jax.vmap(size_of)(states)[:, None], -1) & exists
+    return exists & ~jnp.any(same, axis=1)
 
 
 def orbits_near(model: ForcedModel, guesses: Array, rtol: float) -> Found:
