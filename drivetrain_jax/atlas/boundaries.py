@@ -61,7 +61,7 @@ def boundaries(atlas: Atlas, system: type[System], searches: Sequence[Search] = 
     if len(atlas.parameters) != 2:
         raise ValueError(f"parameters = {', '.join(atlas.parameters)}: expected two; slice the atlas first")
     criteria = Criteria.of(atlas, system)
-    patches = patches_of(criteria)
+    patches = tuple(search.patches for search in searches) or patches_of(criteria)
     curves: list[Boundary] = []
     horizontal = _narrow_axis(atlas, system)
     for number, kind in enumerate(criteria.multipliers):

@@ -32,10 +32,12 @@ _RIM = 1e-9
 
 @dataclass(frozen=True)
 class Search:
-    """``points`` ``(M, 2)`` in coordinates; ``undecided`` boxes ``(K, 2, 2)`` as (lower, upper).
+    """Of the function in ``patches``: ``points`` ``(M, 2)``; ``undecided`` boxes ``(K, 2, 2)`` as (lower, upper).
 
     ``curvature`` ``(M,)`` is f_hh and ``slope`` ``(M,)`` f_v at the points, v the other coordinate.
     """
+
+    patches: Patches
 
     points: np.ndarray
     curvature: np.ndarray
@@ -78,7 +80,7 @@ def critical_points(patches: tuple[Patches, ...], number: int, horizontal: int) 
     beyond = (np.maximum(lower - points, points - upper) > _RIM * (upper - lower)).any(axis=1)
     points, curvature, slope, boxes = (part[~beyond] for part in (points, curvature, slope, boxes))
     keep = _distinct(points, boxes)
-    return Search(points[keep], curvature[keep], slope[keep], np.concatenate(undecided))
+    return Search(patches[number], points[keep], curvature[keep], slope[keep], np.concatenate(undecided))
 
 
 class _Bundle:

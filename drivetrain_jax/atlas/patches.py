@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial.chebyshev import chebder
 
+from drivetrain_jax.atlas.charts import in_threads
 from drivetrain_jax.atlas.criteria import Criteria
-from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes, on_grid, restriction
+from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes, on_grid, restriction, slabs
 from drivetrain_jax.atlas.panels import Panel, chebyshev, grid_positions, position_between
 
 # Nodes of a patch in each coordinate, tail of the series relative to its size, the multiple of it up to which a tail may be
@@ -25,6 +26,10 @@ NODES = 16
 _TAIL = 3e-14
 _ROUNDING = 1e6
 _MAX_PATCHES = 8_000
+# Patches at first along a coordinate over the degree of the panel, of which the functions have four times as much.
+_FIRST = 1 / 3
+# Points whose errors are computed together (small enough for the cache).
+_TOGETHER = 1 << 14
 # Relative enlargement of boxes, so that a root on a face is inside.
 MARGIN = 0.25
 # Offset of a cut from the middle of a box, relative to half its width: a root is then rarely on the face between two boxes.
@@ -195,7 +200,8 @@ def patches_of(criteria: Criteria) -> tuple[Patches, ...]:
 
 def _cover(criteria: Criteria, panel: Panel) -> tuple[Patches, ...]:
     """Patches over one panel, refined along each coordinate until all series have converged."""
-    counts = [max(1, round(degree / NODES)) for degree in panel.degrees]
+    sizes = [slabs(panel.coefficients, k) for k in range(len(panel.degrees))]
+    counts = [max(1, round(_FIRST * np.max(np.flatnonzero(s > _TAIL * s.max()), initial=0))) for s in sizes]
     before = [np.inf] * len(counts)
     while True:
         sample = _sample(criteria, panel, counts)
@@ -258,7 +264,10 @@ def _sample(criteria: Criteria, panel: Panel, counts: list[int]) -> _Sample:
             values = _apply(analysis_matrix(NODES), values, axis)
         return values
 
-    floor, lever = criteria.errors(panel, phi, log_determinant)
+    rows = NODES * max(1, _TOGETHER // (NODES * phi[0, 0].size))
+    parts = [slice(start, start + rows) for start in range(0, phi.shape[1], rows)]
+    bounds = in_threads(parts, lambda part: criteria.errors(panel, phi[:, part], log_determinant[part]))
+    floor, lever = (np.concatenate(x, axis=1) for x in zip(*(pair for _, pair in bounds), strict=True))
     return _Sample(
         series(criteria.derive(phi, log_determinant)),
         series(lever),

@@ -210,7 +210,9 @@ class StabilityAtlas:
         """Results of lanes ``phi`` ``(m, N)``, of which the first are those of ``points``."""
         columns = np.pad(points, ((0, phi.shape[1] - len(points)), (0, 0)), mode="edge")
         values = {name: columns[:, k] for k, name in enumerate(self.atlas.parameters)}
+        name = f"eigenvalues {outputs} {self.rtol} {self.closed_form}"
         kernel = _point_kernel(self.build, outputs, self.rtol, self.closed_form)
+        kernel = self.keep(kernel, compiler_options(march=True), name)
         with _JUDGING:
             results = kernel(phi, self.atlas.panels[number].value_error, values, self.atlas.fixed)
         return {name: np.moveaxis(np.asarray(value), -1, 0) for name, value in results.items()}

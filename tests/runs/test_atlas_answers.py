@@ -279,7 +279,10 @@ def test_a_range_of_speeds_without_extent_has_a_widest_angle():
     found = atlas_answers.widest_angle(atlas, {"Omega": (1.4, 1.4000000000000004)}).data
     beta, margin = found["value"], found["error"]
     assert margin < 1e-5
-    assert atlas(beta=[beta - margin, beta + margin], Omega=1.4)["verdict"].values.tolist() == [0, 1]
+    beside = atlas(beta=beta + margin * np.array([-3, -1, 1, 3]), Omega=1.4)
+    assert np.sign(beside["spectral_radius"].values - 1).tolist() == [-1, -1, 1, 1]
+    # The bound of the radius is wider than that of the angle.
+    assert beside["verdict"].values[[0, 3]].tolist() == [0, 1]
 
 
 @pytest.mark.parametrize(
