@@ -194,6 +194,8 @@ def _restored(problem: Problem, route: Route, full_size: bool, boxes: Shards) ->
 # A block: predicted work of one core in s, upper limits of its points and of the bytes of its results, and least number of
 # full chunks, so that padding the last one costs little. Chunks of lengthy points need no such limit.
 _SECONDS, _MOST_POINTS, _MOST_BYTES, _LEAST_CHUNKS = 2.0, 1 << 18, 1 << 28, 8
+# Blocks of a run of a few seconds, so that Dask workers end together, and work in s below which a block is not divided.
+_BLOCKS, _BRIEFEST = 16, 0.25
 # Number of points from which the work of a block is predicted.
 _SAMPLE = 1024
 # Points whose effort is predicted together (small enough for the cache).
@@ -230,7 +232,8 @@ def block_size(solvers: Sequence[Solver], grid: Grid) -> int:
     seconds *= grid.path_length
     lines = max(min(_MOST_POINTS, _MOST_BYTES // max(grid.result_bytes, 1)) // grid.path_length, 1)
     least = max(solver.chunk * (1 if solver.lengthy else _LEAST_CHUNKS) for solver in solvers)
-    wanted = math.ceil(_SECONDS / seconds) if seconds > _SECONDS / lines else lines
+    work = min(_SECONDS, max(seconds * grid.size / _BLOCKS, _BRIEFEST))
+    wanted = math.ceil(work / seconds) if seconds > work / lines else lines
     return min(max(wanted, least), lines)
 
 

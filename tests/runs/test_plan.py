@@ -60,6 +60,14 @@ def test_a_block_takes_two_seconds(monkeypatch, seconds, lengthy, points):
     assert grid.columns(np.array([0, grid.size - 1]))["a"].tolist() == [1, 2]
 
 
+@pytest.mark.parametrize(("seconds", "points"), [(5e-6, 62_500), (1e-6, 250_000), (1e-3, 2000)])
+def test_a_run_of_a_few_seconds_has_sixteen_blocks(monkeypatch, seconds, points):
+    monkeypatch.setattr(job, "_SECONDS", 2.0)
+    axes = {n: {"start": 1, "stop": 2, "num": 1000} for n in ("a", "b")}
+    grid = engine({"system": "toy", "analysis": "toy", "axes": axes}).grid
+    assert block_size([Solver("s", lambda *_: {}, chunk=16, seconds=seconds)], grid) == points
+
+
 @pytest.mark.parametrize(
     ("effort", "planned"),
     [
