@@ -573,6 +573,7 @@ class Driveline(System):
         """True without damping."""
         return sum(abs(c) for c in self.c) == 0
 
+    @serves("frequency_response", check=check, parameters=_CHAIN, returns=ForcedModel)
     @serves("forced", check=check, parameters=_CHAIN)
     def forced_model(self) -> ForcedModel:
         """The nonlinear chain, and its linearisation (A) in twists with the forcing of the rigid motion."""

@@ -101,6 +101,24 @@ def multipliers(chain: Chain, period: float, rtol: float = 1e-11) -> np.ndarray:
     return np.linalg.eigvals(end.y[:, -1].reshape(n, n))
 
 
+def steady_twists(chain: Chain, period: float, periods: int) -> np.ndarray:
+    """Largest twists [rad] of the shafts in the last one of ``periods`` of the nonlinear motion from rest, ``(N,)``."""
+    n = len(chain["k"])
+
+    def field(tau: float, y: np.ndarray) -> np.ndarray:
+        return np.concatenate([y[n:], np.real(torques(chain, tau, y[:n], y[n:])) / np.asarray(chain["J"])])
+
+    def twists(tau: float, a: np.ndarray) -> list[float]:
+        before = [tau, *a[:-1]]
+        behind = map(_behind, chain["beta"], chain["phase"], before)
+        return [x - r * b for x, r, b in zip(a, chain["ratio"], behind, strict=True)]
+
+    times = period * (periods - 1 + np.linspace(0, 1, 801))
+    start = np.concatenate(rigid(chain, 0.0))
+    end = solve_ivp(field, (0.0, times[-1]), start, t_eval=times, method="DOP853", rtol=1e-9, atol=1e-11)
+    return np.abs([twists(tau, a) for tau, a in zip(times, end.y[:n].T, strict=True)]).max(axis=0)
+
+
 def harmonic_response(chain: Chain, period: float, samples: int, finer: int = 64) -> tuple[np.ndarray, np.ndarray]:
     """Largest twists [rad] and torques [N m] of the shafts in the forced motion of the linear equations, ``(N,)`` each.
 

@@ -421,6 +421,24 @@ def test_phases_across_a_gear_make_up_for_nothing():
     assert alone.speed_variation < found.speed_variation < 2 * alone.speed_variation * 1.01
 
 
+@pytest.mark.full
+def test_branches_over_the_speed_contain_the_steady_states():
+    """Stable orbits attract the motion from rest; an unstable one is not met."""
+    chain: dict[str, Any] = {"k": [90.0, 60.0], "c": [0.6, 0.5], "J": [0.4, 0.3], "beta": [0.0, 0.4]}
+    chain |= {"phase": [0.0, 0.0], "ratio": [1.0, 1.0]}
+    speeds = np.linspace(3.0, 9.0, 13)
+    outputs = ["branch_amplitude", "branch_stability", "branch_spectral_radius"]
+    found = dt.frequency_response(dt.Driveline(**{**chain, "speed": speeds}), outputs=outputs)
+    assert np.all(found.outcome == 0)
+    for i in (0, 6, 12):
+        steady = oracle.steady_twists({**chain, "speed": speeds[i]}, math.pi, 120)
+        stable = np.asarray(found.branch_amplitude[i])[np.asarray(found.branch_stability[i]) == 0]
+        assert np.abs(stable / steady - 1).max(axis=1).min() < 1e-4
+        orbit = dt.forced(dt.Driveline(**{**chain, "speed": speeds[i]}), outputs=["orbit_spectral_radius"])
+        radii = np.asarray(found.branch_spectral_radius[i])
+        assert np.nanmin(np.abs(radii - orbit.orbit_spectral_radius)) < 1e-8
+
+
 def test_unstable_ranges_are_those_between_changes_of_the_verdict(monkeypatch):
     """A wide range, and one that is narrower than the distance of samples, at a predicted resonance."""
     shaft = {"k": (4e4, 1e4), "J": (0.1, 0.4)}

@@ -85,12 +85,13 @@ def _solve_branches(
     system: type[System], request: Request, values: Mapping[str, Any], effort: Array
 ) -> dict[str, Array]:
     """The requested results of one line; ``effort`` only orders the batches."""
-    speed, n = system.role("speed"), len(system.state)
+    speed = system.role("speed")
     rising, place = np.unique(np.asarray(values[speed]), return_inverse=True)
 
     def model_at(value: Any) -> ForcedModel:
         return system.models["frequency_response"].build({**values, speed: value})
 
+    n = model_at(rising[0]).size or len(system.state)
     special = not {"fold_frequency", "doubling_frequency"}.isdisjoint(request.outputs)
     guesses, every, frequencies = _branches_of_orbits(model_at, rising, n, special)
 
