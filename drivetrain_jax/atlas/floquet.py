@@ -93,7 +93,7 @@ def prepare_judging(
     box, ends = domain.box(), (np.array(domain.lower), np.array(domain.upper))
     panel = Panel(box.lower, box.upper, np.zeros((*[1] * len(ranges), _form(system, domain).size ** 2)), 0.0)
     zero = Atlas(domain.parameters, domain.coordinates, *ends, domain.fixed, (panel,), (), 0.0, 0)
-    stability_atlas(zero, system, rtol).by_eigenvalues((ends[0] + ends[1])[None] / 2, tuple(outputs))
+    stability_atlas(zero, system, rtol).by_eigenvalues((ends[0] + ends[1])[None] / 2, tuple(outputs), many=True)
 
 
 def stability_atlas(atlas: Atlas, system: type[System], rtol: float) -> StabilityAtlas:

@@ -36,8 +36,8 @@ from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
 DEFAULT_OUTPUTS = ("spectral_radius", "spectral_radius_error", "verdict")
 _FAST = frozenset(DEFAULT_OUTPUTS)
-# Points per call of the kernel of eigenvalues.
-_BLOCK = 1024
+# Points per call of the kernel of eigenvalues, and up to which it is not optimised: compiling takes longer.
+_BLOCK, _FEW = 1024, 8192
 # Held during a call: a kernel requested while another thread compiles it would be compiled twice.
 _JUDGING = Lock()
 
@@ -85,8 +85,11 @@ class StabilityAtlas:
             results[name][again] = values
         return results
 
-    def by_eigenvalues(self, points: np.ndarray, outputs: Sequence[str]) -> dict[str, np.ndarray]:
-        """As :meth:`at`, but all points by the eigenvalues of Z."""
+    def by_eigenvalues(
+        self, points: np.ndarray, outputs: Sequence[str], *, many: bool = False
+    ) -> dict[str, np.ndarray]:
+        """As :meth:`at`, but all points by the eigenvalues of Z; ``many`` takes the kernel of many points for few."""
+        few = len(points) <= _FEW and not many
         x, results = self.atlas.to_coordinates(points), self.blank((len(points),), outputs)
         number = self.atlas.find(x)
         for k, panel in enumerate(self.atlas.panels):
@@ -95,7 +98,7 @@ class StabilityAtlas:
             for start in range(0, len(mine), _BLOCK):
                 part, lanes = mine[start : start + _BLOCK], phi[:, start : start + _BLOCK]
                 lanes = np.pad(lanes, ((0, 0), (0, _BLOCK - len(part))), mode="edge")
-                for name, value in self._exact_results(k, points[part], lanes, tuple(outputs)).items():
+                for name, value in self._exact_results(k, points[part], lanes, tuple(outputs), few).items():
                     results[name][part] = value[: len(part)]
         return results
 
@@ -205,14 +208,14 @@ class StabilityAtlas:
         return model.hamiltonian is not None and bool(np.any(model.hamiltonian()))
 
     def _exact_results(
-        self, number: int, points: np.ndarray, phi: np.ndarray, outputs: tuple[str, ...]
+        self, number: int, points: np.ndarray, phi: np.ndarray, outputs: tuple[str, ...], few: bool
     ) -> dict[str, np.ndarray]:
         """Results of lanes ``phi`` ``(m, N)``, of which the first are those of ``points``."""
         columns = np.pad(points, ((0, phi.shape[1] - len(points)), (0, 0)), mode="edge")
         values = {name: columns[:, k] for k, name in enumerate(self.atlas.parameters)}
         name = f"eigenvalues {outputs} {self.rtol} {self.closed_form}"
-        kernel = _point_kernel(self.build, outputs, self.rtol, self.closed_form)
-        kernel = self.keep(kernel, compiler_options(march=True), name)
+        options = options_for_few() if few else compiler_options(march=True)
+        kernel = self.keep(_point_kernel(self.build, outputs, self.rtol, self.closed_form, few), options, name)
         with _JUDGING:
             results = kernel(phi, self.atlas.panels[number].value_error, values, self.atlas.fixed)
         return {name: np.moveaxis(np.asarray(value), -1, 0) for name, value in results.items()}
@@ -235,7 +238,7 @@ def _store(results: Mapping[str, np.ndarray], tile: Tile, cells: charts.Cells) -
 
 
 @lru_cache(maxsize=16)
-def _point_kernel(build: Build, outputs: tuple[str, ...], rtol: float, closed_form: bool) -> Any:
+def _point_kernel(build: Build, outputs: tuple[str, ...], rtol: float, closed_form: bool, few: bool) -> Any:
     """The kernel of scattered points, by eigenvalues from Phi; all atlases share it, because compiling takes seconds."""
 
     def kernel(phi, error, values, fixed):
@@ -246,7 +249,7 @@ def _point_kernel(build: Build, outputs: tuple[str, ...], rtol: float, closed_fo
         results |= _sharper(phi, model, error, results)
         return {name: results[name] for name in (*outputs, "outcome")}
 
-    return jax.jit(kernel, compiler_options=compiler_options(march=True))
+    return jax.jit(kernel, compiler_options=options_for_few() if few else compiler_options(march=True))
 
 
 def _sharper(phi: Array, model: FloquetModel, error_of_phi: Array, results: dict[str, Array]) -> dict[str, Array]:

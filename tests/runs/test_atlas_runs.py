@@ -626,5 +626,6 @@ def test_the_kernel_of_single_cells_compiles_during_the_solves(monkeypatch):
     stability._point_kernel.cache_clear()
     monkeypatch.setattr(stability, "_point_kernel", lambda *key: made.append(key) or once(*key))
     monkeypatch.setattr(through_atlas, "_LARGE", 1)
+    monkeypatch.setattr(stability, "_FEW", 0)
     dt.run(floquet("atlas"))
     assert len(set(made)) == 1
