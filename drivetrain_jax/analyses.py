@@ -31,7 +31,7 @@ from drivetrain_jax.analysis._base import checked_solvers, dimensions_of, make_r
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
 from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lanes_last, path_entry, with_lanes
 from drivetrain_jax.systems import System
-from drivetrain_jax.systems._base import printed
+from drivetrain_jax.systems._base import printed, scaled
 
 # Lanes of similar effort that are solved together, and lanes whose program is compiled without optimisation.
 _TOGETHER, _FEW = 128, 128
@@ -277,31 +277,11 @@ def _tangents(results: dict[str, Array], jacobians: dict[str, Array], directions
     def tangent(name: str, result: Array) -> Array:
         if name in jacobians:
             jacobian = jnp.asarray(jacobians[name], result.dtype).reshape(result.size, direction.size)
-            return _product(jacobian, direction.astype(result.dtype)).reshape(result.shape)
+            return jnp.sum(scaled(jacobian, direction.astype(result.dtype)), axis=1).reshape(result.shape)
         unknown = 0.0 if name.endswith(("_error", "_residual")) else jnp.nan
         return jnp.full(result.shape, unknown, result.dtype) * jnp.sum(direction)
 
     return {name: tangent(name, x) for name, x in results.items()}
-
-
-def _product(jacobian: Array, direction: Array) -> Array:
-    """``jacobian @ direction``, in which 0 times NaN is 0, also when transposed.
-
-    A NaN thus affects only its own result and parameter. The product is written as the solution x of
-    ``x = (jacobian @ direction, direction)``, because jax accepts a given transpose of a linear solve.
-    """
-    count = len(jacobian)
-
-    def times(matrix: Array, vector: Array) -> Array:
-        return jnp.sum(jnp.where(vector == 0, 0.0, matrix * vector), axis=1)
-
-    solution = jax.lax.custom_linear_solve(
-        lambda x: x.at[:count].add(-jacobian @ x[count:]),
-        jnp.pad(direction, (count, 0)),
-        lambda _, b: b.at[:count].add(times(jacobian, b[count:])),
-        lambda _, b: b.at[count:].add(times(jacobian.T, b[:count])),
-    )
-    return solution[:count]
 
 
 def _solve(job: _Job, index: int, parameters: Any, effort: Array | None = None) -> dict[str, Array]:

@@ -236,6 +236,26 @@ def numeric(*values: Any) -> tuple[Any, ...]:
     return module, *(module.asarray(value, float) for value in values)
 
 
+def scaled(factor: Any, x: Any) -> Array:
+    """``factor * x``, in which NaN times 0 is 0, also when transposed: a NaN affects only its own result and parameter.
+
+    The product is written as the solution y of ``y = (factor * x, x)``, because jax accepts a given transpose of a linear
+    solve.
+    """
+    factor, x = jnp.broadcast_arrays(factor, x)
+
+    def times(y: Array) -> Array:
+        return jnp.where(y == 0, 0.0, factor * y)
+
+    solution = jax.lax.custom_linear_solve(
+        lambda y: y.at[0].add(-factor * y[1]),
+        jnp.stack([jnp.zeros_like(x), x]),
+        lambda _, b: b.at[0].add(times(b[1])),
+        lambda _, b: b.at[1].add(times(b[0])),
+    )
+    return solution[0]
+
+
 def parameter(units: str, long_name: str, **more: Any) -> Any:
     """A field of a :class:`System`: a parameter in ``units``; ``more`` as in :class:`Parameter` (default, range, ...).
 

@@ -25,7 +25,18 @@ from jax.tree_util import Partial
 from drivetrain_jax._errors import counted
 from drivetrain_jax._quantities import Component, Dimension, Variable
 from drivetrain_jax.resonances import DRIVELINE
-from drivetrain_jax.systems._base import POSITIVE, RPM, Number, PhysicalData, System, Values, numeric, parameter, serves
+from drivetrain_jax.systems._base import (
+    POSITIVE,
+    RPM,
+    Number,
+    PhysicalData,
+    System,
+    Values,
+    numeric,
+    parameter,
+    scaled,
+    serves,
+)
 from drivetrain_jax.systems._models import (
     Block,
     FloquetModel,
@@ -93,18 +104,22 @@ def _traced_half_turns(speeds: Sequence[Any], bent: Sequence[Any]) -> Array:
         whole = jnp.round(first * jnp.abs(speed)).astype(int)
         divisor = jnp.where(counts, jnp.gcd(divisor, whole), divisor)
     turns = first / jnp.maximum(divisor, 1)
-    return jnp.where(jnp.any(common, axis=0) & (turns <= 2 * MOST_TURNS), turns, jnp.nan)
+    turns = jnp.where(jnp.any(common, axis=0) & (turns <= 2 * MOST_TURNS), turns, jnp.nan)
+    for speed, counts in zip(speeds, bent, strict=True):
+        turns = _stepped(turns, speed, counts)
+    return turns
 
 
 @jax.custom_jvp
-def _without_derivative(x: Any, where: Any) -> Any:
-    """``x``, whose derivative is NaN ``where`` the period depends on it."""
-    return x
+def _stepped(turns: Any, speed: Any, bent: Any) -> Any:
+    """``turns``, whose derivative by the relative ``speed`` of a joint is NaN where the joint is ``bent``."""
+    return turns
 
 
-@_without_derivative.defjvp
-def _(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
-    return primals[0], jnp.where(primals[1], jnp.nan, 1.0) * tangents[0]
+@_stepped.defjvp
+def _(primals: tuple[Any, Any, Any], tangents: tuple[Any, Any, Any]) -> tuple[Any, Any]:
+    turns, _, bent = primals
+    return turns, tangents[0] + scaled(jnp.where(bent, jnp.nan, 0.0), tangents[1])
 
 
 # The rigid motion.
@@ -373,14 +388,6 @@ class Driveline(System):
         """``beta``, ``phase`` and ``ratio`` of all elements."""
         return self.entries("beta"), self.entries("phase"), self.entries("ratio", 1.0)
 
-    def _joints(self, tau: Any, cosine: Any, sine: Any, order: int = 1) -> list[Joint]:
-        beta, phase, ratio = self.chain
-        ratios, later = [], False
-        for b, r in zip(reversed(beta), reversed(ratio), strict=True):
-            ratios.append(r if _is_number(r) else _without_derivative(r, later))
-            later |= b != 0
-        return rigid_motion(beta, phase, ratios[::-1], tau, cosine, sine, order)
-
     def half_turns(self) -> Any:
         """The period T of the joints over pi; NaN if they have none of up to `MOST_TURNS` turns, 1 without joints.
 
@@ -438,7 +445,7 @@ class Driveline(System):
         """Right-hand side of the linear equations (A) in twists, with the forcing f of the rigid motion if ``forced``."""
         count = len(self.k)
         theta, rates = list(y[:count]), list(y[count:])
-        joints = self._joints(*clock(tau), 2)
+        joints = rigid_motion(*self.chain, *clock(tau))
         x, v, excess = 0.0, 0.0, []
         for joint, twist, slope in zip(joints, theta, rates, strict=True):
             excess.append(2 * joint.slope * v + joint.curve * x + (joint.slope * joint.rate if forced else 0.0))
@@ -456,7 +463,7 @@ class Driveline(System):
     def _absolute(self, *at: Any) -> tuple[list[Any], list[Any], list[Any], list[Any], list[Any]]:
         """E and P of q'' + E q' + P q = 0, q = J^(1/2) x: both diagonals, the entries left of them, and those of P right."""
         w, k, c, inertia = self.speed, self.k, self.c, self.J
-        joints = self._joints(*at)
+        joints = rigid_motion(*self.chain, *at, order=1)
         damping, stiffness, left, right, coupling = [], [], [], [], []
         for i, joint in enumerate(joints):
             damping.append(c[i] / (w * inertia[i]))

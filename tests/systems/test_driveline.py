@@ -176,6 +176,16 @@ def test_traced_ratios_without_a_common_period_have_none():
     assert np.isnan(jax.jit(lambda s: s.half_turns())(shaft))
 
 
+def test_ratios_before_a_joint_alone_have_no_derivative():
+    """The period depends on them by steps."""
+    shaft = dt.Driveline(speed=9.0, k=[9.0] * 3, c=[0.1] * 3, J=[1.0] * 3, beta=[0.2, 0.3, 0.0], ratio=[1.5, 1.0, 0.5])
+    for derivative in (jax.jacfwd, jax.jacrev):
+        slopes = quick_jit(derivative(lambda s: s.half_turns() * s.linear_field(0.3, jnp.full(6, 0.1))))(shaft)
+        missing = jax.tree.map(lambda x: bool(jnp.any(jnp.isnan(x))), slopes)
+        assert missing.ratio == (True, False, False)
+        assert not any(jax.tree.leaves((missing.speed, missing.k, missing.c, missing.J, missing.beta)))
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -235,15 +245,15 @@ def test_forced_twists_and_torques_are_those_of_harmonics(number):
 @pytest.mark.full
 @pytest.mark.parametrize("name", ["torque", "orbit_torque"])
 def test_derivatives_of_torques_are_those_of_differences(name):
-    chain: dict[str, Any] = {name: x for name, x in lagrange_cases()[0].items() if name not in ("phase", "ratio")}
-    chain |= {"beta": [0.0, 0.3, 0.0]}
+    chain: dict[str, Any] = lagrange_cases()[0] | {"beta": [0.0, 0.3, 0.2]}
     torque = lambda s: getattr(dt.forced(s, outputs=[name], rtol=1e-12), name)[1]  # noqa: E731
     slope = jax.grad(torque)(dt.Driveline(**chain))
-    for key, i in (("k", 1), ("c", 1), ("J", 0), ("beta", 1)):
+    for key, i in (("k", 1), ("c", 1), ("J", 0), ("beta", 1), ("phase", 1), ("ratio", 2)):
         step = 1e-4 * chain[key][i]
         moved: list[Any] = [[x + s * (j == i) for j, x in enumerate(chain[key])] for s in (-step, step)]
         ends = [float(torque(dt.Driveline(**{**chain, key: values}))) for values in moved]
         assert getattr(slope, key)[i] == pytest.approx((ends[1] - ends[0]) / (2 * step), rel=1e-5)
+    assert np.isnan(slope.ratio[0])
 
 
 @pytest.mark.full

@@ -179,7 +179,7 @@ def periodic_slopes(
     import diffrax
 
     n, size = state.size, size_of(state)
-    lifted, scale = _lifted(field, parameters, n, size)
+    lifted, scale, known = _lifted(field, parameters, state, size)
     places, rows_at = peaks
     order = jnp.argsort(places)
     solution = diffrax.diffeqsolve(
@@ -197,7 +197,7 @@ def periodic_slopes(
     )
     values = jnp.where(solution.result == diffrax.RESULTS.successful, solution.ys, jnp.nan)  # pyright: ignore[reportArgumentType]
     on_peaks, end = values[:-1][jnp.argsort(order)], values[-1]
-    moved = solve(jnp.eye(n) - end[1 : n + 1].T, end[n + 1 :].T)
+    moved = jnp.where(known, solve(jnp.eye(n) - end[1 : n + 1].T, end[n + 1 :].T), jnp.nan)
     by_parameter = jnp.stack(jax.tree.leaves(jax.jacfwd(rows_at)(parameters)), axis=-1) * scale
     tops = [
         jnp.sign(row @ y[0]) * (row @ (y[1 : n + 1].T @ moved + y[n + 1 :].T) + y[0] @ slope)
@@ -206,23 +206,27 @@ def periodic_slopes(
     return PeriodicSlopes(size * moved / scale, size * jnp.array(tops).reshape(-1, scale.size) / scale)
 
 
-def _lifted(field: Parametric, parameters: Any, n: int, size: Array) -> tuple[Callable[..., Array], Array]:
-    """The field of the rows ``y/size``, V and S, ``(1 + n + P, n)``, and the unit of every parameter, ``(P,)``."""
+def _lifted(field: Parametric, parameters: Any, state: Array, size: Array) -> tuple[Callable[..., Array], Array, Array]:
+    """The field of the rows ``y/size``, V and S, ``(1 + n + P, n)``; the unit of every parameter, ``(P,)``; and flags of
+    those by which the field has a derivative, the only ones whose rows move."""
     leaves, tree = jax.tree.flatten(parameters)
-    point = jnp.stack(leaves)
+    point, n = jnp.stack(leaves), state.size
     # Relative changes of the parameters keep all rows of similar size.
     scale = jnp.where(point == 0, 1.0, jnp.abs(point))
-    directions = jnp.concatenate([jnp.zeros((n, point.size)), jnp.eye(point.size)])
+
+    def right(s: Any, y: Array, change: Array) -> Array:
+        moved = jax.tree.unflatten(tree, list(point + scale * change))
+        return field(moved, s, size * y) / size
+
+    # NaN in one row would end the integration of all.
+    known = jnp.all(jnp.isfinite(jax.jacfwd(right, 2)(0.0, state / size, jnp.zeros(point.size))), axis=0)
+    directions = jnp.concatenate([jnp.zeros((n, point.size)), jnp.diag(known.astype(float))])
 
     def lifted(s: Any, rows: Array, _: None) -> Array:
-        def right(y: Array, change: Array) -> Array:
-            moved = jax.tree.unflatten(tree, list(point + scale * change))
-            return field(moved, s, size * y) / size
-
-        slope, push = jax.linearize(right, rows[0], jnp.zeros(point.size))
+        slope, push = jax.linearize(lambda y, change: right(s, y, change), rows[0], jnp.zeros(point.size))
         return jnp.concatenate([slope[None], jax.vmap(push)(rows[1:], directions)])
 
-    return lifted, scale
+    return lifted, scale, known
 
 
 # Approximate orbits by continuation, which Newton's method then corrects.
