@@ -156,8 +156,7 @@ def rigid_motion(
     the angle itself is needed at a gear alone.
     """
     joints, angle, rate, acceleration = [], tau, 1.0, 0.0
-    last = max((i for i, b in enumerate(beta) if not _is_straight(b)), default=-1)
-    gears = [i for i in range(last) if not (_is_number(ratio[i]) and ratio[i] == 1)]
+    last, gears = _gears(beta, ratio)
     for i, (b, p, r) in enumerate(zip(beta, phase, ratio, strict=True)):
         if _is_straight(b):
             joints.append(Joint(r, 0.0, 0.0, rate))
@@ -195,6 +194,12 @@ def behind(beta: Any, phase: Any, angle: Any) -> Any:
 
 def _is_straight(beta: Any) -> bool:
     return _is_number(beta) and beta == 0
+
+
+def _gears(beta: Components, ratio: Components) -> tuple[int, list[int]]:
+    """Number of the last joint, -1 without any, and the numbers of the gears before it."""
+    last = max((i for i, b in enumerate(beta) if not _is_straight(b)), default=-1)
+    return last, [i for i in range(last) if not (_is_number(ratio[i]) and ratio[i] == 1)]
 
 
 def check(fixed: Values) -> None:
@@ -284,8 +289,8 @@ def uneven_rotation(beta: Components, phase: Components, ratio: Components, half
 
     Without gears the chain is one joint, eq. (8): 4 rho/(1 - rho^2) and 2 asin(rho).
     """
-    last = max((i for i, x in enumerate(beta) if not _is_straight(x)), default=0)
-    if all(_is_number(r) and r == 1 for r in ratio[:last]):
+    last, gears = _gears(beta, ratio)
+    if not gears:
         b: Any = jnp.zeros((), complex)
         for angle, p in zip(beta, phase, strict=True):
             b = _moved(b, jnp.tan(angle / 2) ** 2, p)
@@ -460,67 +465,37 @@ class Driveline(System):
         upper = tuple(tuple(1.0 if j == i + half else 0 for j in range(2 * half)) for i in range(half))
         return upper + tuple(tuple(column[half + i] for column in columns) for i in range(half))
 
-    def _absolute(self, *at: Any) -> tuple[list[Any], list[Any], list[Any], list[Any], list[Any]]:
-        """E and P of q'' + E q' + P q = 0, q = J^(1/2) x: both diagonals, the entries left of them, and those of P right."""
+    def _absolute(self, *at: Any) -> tuple[list[list[Any]], list[list[Any]]]:
+        """E and P of q'' + E q' + P q = 0, q = J^(1/2) x."""
         w, k, c, inertia = self.speed, self.k, self.c, self.J
-        joints = rigid_motion(*self.chain, *at, order=1)
-        damping, stiffness, left, right, coupling = [], [], [], [], []
-        for i, joint in enumerate(joints):
-            damping.append(c[i] / (w * inertia[i]))
-            stiffness.append(k[i] / (w**2 * inertia[i]))
+        damping, stiffness = ([[0] * len(k) for _ in k] for _ in range(2))
+        for i, joint in enumerate(rigid_motion(*self.chain, *at, order=1)):
+            damping[i][i] = c[i] / (w * inertia[i])
+            stiffness[i][i] = k[i] / (w**2 * inertia[i])
             if i:
-                root = jnp.sqrt(inertia[i]) * jnp.sqrt(inertia[i - 1])
-                damping[-2] = damping[-2] + joint.h**2 * c[i] / (w * inertia[i - 1])
-                stiffness[-2] = stiffness[-2] + joint.h * (joint.h * k[i] / w + joint.slope * c[i]) / (
-                    w * inertia[i - 1]
-                )
-                left.append(-joint.h * c[i] / (w * root))
-                right.append(-joint.h * k[i] / (w**2 * root))
-                coupling.append(right[-1] - joint.slope * c[i] / (w * root))
-        return damping, stiffness, left, coupling, right
+                j, root = i - 1, jnp.sqrt(inertia[i]) * jnp.sqrt(inertia[i - 1])
+                damping[j][j] = damping[j][j] + joint.h**2 * c[i] / (w * inertia[j])
+                both = joint.h * (joint.h * k[i] / w + joint.slope * c[i])
+                stiffness[j][j] = stiffness[j][j] + both / (w * inertia[j])
+                damping[i][j] = damping[j][i] = -joint.h * c[i] / (w * root)
+                stiffness[j][i] = -joint.h * k[i] / (w**2 * root)
+                stiffness[i][j] = stiffness[j][i] - joint.slope * c[i] / (w * root)
+        return damping, stiffness
 
     def _rows(self, *at: Any) -> Rows:
         """``(q, q')' = A (q, q')`` of the absolute rotations, eq. (A)."""
-        damping, stiffness, left, coupling, right = self._absolute(*at)
+        damping, stiffness = self._absolute(*at)
         n = len(damping)
-
-        def entry(i: int, j: int, diagonal: Components, below: Components, above: Components) -> Any:
-            if i == j:
-                return -diagonal[i]
-            return -below[j] if i == j + 1 else -above[i] if j == i + 1 else 0
-
         upper = tuple(tuple(1.0 if j == i + n else 0 for j in range(2 * n)) for i in range(n))
-        return upper + tuple(
-            (
-                *(entry(i, j, stiffness, coupling, right) for j in range(n)),
-                *(entry(i, j, damping, left, left) for j in range(n)),
-            )
-            for i in range(n)
-        )
+        return upper + tuple(tuple(-x for x in (*p, *e)) for p, e in zip(stiffness, damping, strict=True))
 
     def _reversal(self, half: Any) -> tuple[Rows, Rows]:
         """``R0`` and ``R1``, which lead from half a period to the period: N is even about both of its ends."""
-        n = len(self.k)
-
-        def damping(tau: Any) -> list[list[Any]]:
-            diagonal, _, beside, _, _ = self._absolute(*clock(tau))
-            return [
-                [diagonal[i] if i == j else beside[min(i, j)] if abs(i - j) == 1 else 0 for j in range(n)]
-                for i in range(n)
-            ]
-
-        unit, none = np.eye(n).tolist(), [0] * n
-        start = [[-x for x in row] for row in damping(0.0)]
-        upper, lower = [none + row for row in unit], [u + row for u, row in zip(unit, start, strict=True)]
-        end = [row + u for row, u in zip(damping(half), unit, strict=True)], [u + none for u in unit]
-        return tuple(map(tuple, upper + lower)), tuple(map(tuple, end[0] + end[1]))
-
-    @property
-    def _without_gears(self) -> bool:
-        """True if no ratio before a joint differs from 1."""
-        beta, _, ratio = self.chain
-        last = max((i for i, b in enumerate(beta) if not _is_straight(b)), default=0)
-        return all(_is_number(r) and r == 1 for r in ratio[:last])
+        start, end = (self._absolute(*clock(tau))[0] for tau in (0.0, half))
+        unit, none = np.eye(len(end)).tolist(), [0] * len(end)
+        first = [none + u for u in unit] + [u + [-x for x in row] for u, row in zip(unit, start, strict=True)]
+        last = [row + u for u, row in zip(unit, end, strict=True)] + [u + none for u in unit]
+        return tuple(map(tuple, first)), tuple(map(tuple, last))
 
     @property
     def is_even(self) -> bool:
@@ -537,13 +512,11 @@ class Driveline(System):
         total, b = 0.0, 0j
         for i, (beta, phase, ratio) in enumerate(zip(*self.chain, strict=True)):
             rho = jnp.tan(beta / 2) ** 2
-            turn = jnp.exp(2j * phase)
-            s = -rho * turn * b
+            s = -rho * jnp.exp(2j * phase) * b
             mean = (1 + rho**2) / (1 - rho**2) * ((1 + s) / (1 - s)).real + 2 * (s / (1 - s) ** 2).real
             share = 1 / self.J[i] + (ratio**2 * mean / self.J[i - 1] if i else 0.0)
             total = total + self.c[i] * share
-            a = rho * jnp.conj(turn)
-            b = (b + a) / (1 + jnp.conj(a) * b)
+            b = _moved(b, rho, phase)
         return jnp.asarray(-math.pi / self.speed * total)
 
     def panels(self, rtol: float) -> np.ndarray:
@@ -607,13 +580,12 @@ class Driveline(System):
             return Partial(method, self, *more)
 
         kind, period = type(self), math.pi * self.half_turns()
-        exact = own(kind.log_determinant) if self._without_gears else None
+        beta, _, ratio = self.chain
+        exact = None if _gears(beta, ratio)[1] else own(kind.log_determinant)
         natural = LinearPeriodic(own(kind._twist_rows), period, clock, log_determinant=exact)
-        rows = own(kind._rows)
-        reduced = LinearPeriodic(rows, period, clock, log_determinant=exact)
-        if self.is_even:
-            half = period / 2
-            reduced = LinearPeriodic(rows, half, clock, log_determinant=exact, reversal=own(kind._reversal, half))
+        span = period / 2 if self.is_even else period
+        reversal = own(kind._reversal, span) if self.is_even else None
+        reduced = LinearPeriodic(own(kind._rows), span, clock, log_determinant=exact, reversal=reversal)
         return FloquetModel(
             natural=natural, reduced=reduced, panels=own(kind.panels), hamiltonian=own(kind.is_hamiltonian)
         )
@@ -642,16 +614,6 @@ class Driveline(System):
         factor = weighted_factor(extensions, stiffness, mass)
         identity = np.eye(n).reshape(n, n, 1, *(1,) * len(shape))
         whole = Block(factor, np.zeros(n, int), np.zeros(n, bool), jnp.broadcast_to(identity, (n, n, 1, *shape)))
-        names = tuple(f"a_{i}" for i in range(n))
-        return SpringSystem(
-            extensions,
-            stiffness,
-            mass,
-            (whole,),
-            whole,
-            jnp.zeros(shape),
-            names,
-            tuple(f"inertia_{i}" for i in range(n)),
-            np.arange(n),
-            1,
-        )
+        names, inertias = (tuple(f"{name}_{i}" for i in range(n)) for name in ("a", "inertia"))
+        zero, numbers = jnp.zeros(shape), np.arange(n)
+        return SpringSystem(extensions, stiffness, mass, (whole,), whole, zero, names, inertias, numbers, 1)
