@@ -357,10 +357,11 @@ def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[An
 
 def _overrides(options: argparse.Namespace) -> dict[str, Any]:
     """Entries of the scene that the command line replaces."""
-    from drivetrain_jax.runs.physical import read_table
+    from drivetrain_jax.runs.physical import PARTS, read_table
 
     table = {} if options.data is None else read_table(options.data)
-    return {f"fixed.{name}": value for name, value in table.items()} | assignments(options.set, "--set")
+    entries = {name if name == PARTS else f"fixed.{name}": value for name, value in table.items()}
+    return entries | assignments(options.set, "--set")
 
 
 def status(options: argparse.Namespace) -> int:

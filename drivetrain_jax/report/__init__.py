@@ -20,7 +20,7 @@ import xarray as xr
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.datasets.figure import drawn, in_physical_data
-from drivetrain_jax.report.statements import amplitudes, axes_table, fixed_table, statements, values_tables
+from drivetrain_jax.report.statements import amplitudes, axes_table, chain, fixed_table, statements, values_tables
 from drivetrain_jax.store import checksums
 from drivetrain_jax.store.consolidate import open_result
 from drivetrain_jax.view import charts
@@ -119,6 +119,7 @@ def _section(path: Path, number: int, asked: list[str], amplitude: Any) -> dict[
         "title": str(attrs.get("title") or path.name),
         "file": path.name,
         "statements": [*answers, *statements(handy, not answers, limit, moved)],
+        "chain": chain(handy),
         "axes": axes_table(handy),
         "fixed": fixed,
         "values": values_tables(handy),

@@ -22,6 +22,7 @@ from drivetrain_jax.view.style import (
     in_brackets,
     ranges_text,
     scene_key,
+    scene_of,
     suitable,
     unit_of,
     units_of,
@@ -253,6 +254,29 @@ def fixed_table(dataset: xr.Dataset) -> list[tuple[str, ...]]:
         factor, units = unit_of(dataset, name, entry.get("units", "1"))
         rows.append((name, entry.get("long_name", ""), digits(_times(entry["value"], factor)), written_units(units)))
     return rows
+
+
+# Lists of a driveline in its drawing, each with the entry that stands for nothing.
+_ELEMENTS = {"beta": 0.0, "phase": 0.0, "ratio": 1.0, "k": None, "J": None}
+
+
+def chain(dataset: xr.Dataset) -> list[dict[str, str]]:
+    """The texts in the drawing of a driveline: name, joint, gear, stiffness and inertia of each element; else empty."""
+    fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}"))
+    lists = {name: fixed[name] for name in _ELEMENTS if name in fixed and fixed[name]["value"]}
+    if dataset.attrs.get("system") != "driveline" or not lists:
+        return []
+    varying = {scene_key(c) for c in dataset.coords.values() if c.ndim}
+
+    def text(name: str, i: int) -> str:
+        if name not in lists or f"{name}[{i}]" in varying:
+            return f"{name} varies" if name in lists else ""
+        value, (factor, units) = lists[name]["value"][i], unit_of(dataset, name, lists[name]["units"])
+        return "" if value == _ELEMENTS[name] else f"{digits(value * factor)} {written_units(units)}".removesuffix(" 1")
+
+    count = len(next(iter(lists.values()))["value"])
+    names = scene_of(dataset).get("parts") or [str(i + 1) for i in range(count)]
+    return [{"name": names[i], **{name: text(name, i) for name in _ELEMENTS}} for i in range(count)]
 
 
 Table = tuple[list[str], list[list[str]]]

@@ -167,8 +167,8 @@ def _numbers(parameter: Parameter, value: Any, physical: bool) -> Any:
     return value if hasattr(value, "ndim") else numbers
 
 
-# The column of a table with names for the reader alone.
-_NAMES = "part"
+# The column of a table with the names of its rows, and the entry of a scene that holds them.
+_NAMES, PARTS = "part", "parts"
 _HEADER = re.compile(r"\s*(.+?)\s*(?:[\[(]\s*(.*?)\s*[\])])?\s*")
 
 
@@ -176,16 +176,18 @@ def read_table(path: Path) -> dict[str, Any]:
     """The parameters in the CSV, XLSX or TOML ``path``: a value or a list by name, ``"60 mm"`` with the unit of the header.
 
     The first row holds ``name [unit]`` or ``name (unit)``; empty cells below a column are left out, and so are columns
-    without a name and the column ``part``, which names the rows. TOML has a table ``[[part]]`` with a ``name`` for each row.
-    Raises :class:`InputError` for a file that is no such table.
+    without a name. The column ``part`` names the rows: these are the ``parts`` of the scene. TOML has a table ``[[part]]``
+    with a ``name`` for each row. Raises :class:`InputError` for a file that is no such table.
     """
     rows = _rows(path).dropna(how="all")
     columns: dict[str, Any] = {}
     if len(rows) < 2:
         raise _wrong_table(path, "no values", "a row of names and rows of values")
     for header, *cells in (rows[number].tolist() for number in rows):
-        name, unit = _HEADER.fullmatch(header).groups() if isinstance(header, str) else (_NAMES, "")  # pyright: ignore[reportOptionalMemberAccess]
+        name, unit = _HEADER.fullmatch(header).groups() if isinstance(header, str) else ("", "")  # pyright: ignore[reportOptionalMemberAccess]
         if name == _NAMES:
+            columns[PARTS] = [cell.strip() if isinstance(cell, str) else "" for cell in cells]
+        if name in ("", _NAMES):
             continue
         values = [_value(path, name, cell.strip(), unit) for cell in cells if isinstance(cell, str)]
         if name in columns:

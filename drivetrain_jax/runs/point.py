@@ -21,7 +21,7 @@ from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_r
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.job import Job
-from drivetrain_jax.runs.physical import described, read_table
+from drivetrain_jax.runs.physical import PARTS, described, read_table
 from drivetrain_jax.runs.reply import (
     Limit,
     Reply,
@@ -338,6 +338,9 @@ def _tree(system_name: str, analysis_name: str, given: Mapping[str, Any]) -> dic
         # What the path follows from is fixed like the path itself.
         numbers -= {name for rule in system.physical.conversions if rule.parameter == path for name in rule.needs}
     for name, value in given.items():
+        if name == PARTS:
+            tree[PARTS] = value
+            continue
         if name not in names:
             guess = did_you_mean(name, (*names, "outputs", "amplitude")) or meant(name, parameters.values())
             raise InputError(f"{name} = {shown(value)}: unknown{guess}; expected {', '.join(names)}")

@@ -27,6 +27,8 @@ Value = float | int | str | tuple[float, ...]
 Ranges = dict[str, tuple[float, float]]
 # Assumed length of a dimension that depends on the system.
 _USUAL_SIZE = 4
+# Dimensions of the elements of a chain, which the parts of a scene name.
+_OF_ELEMENTS = ("shaft", "joint")
 # Name of the system that stands for a function in the scene of its sweep.
 FUNCTION = "function"
 
@@ -99,11 +101,20 @@ def _restored(kind: type[Problem], values: dict[str, Any]) -> Problem:
 
 @dataclass(frozen=True, eq=False)
 class Scene(Problem):
-    """A checked scene; ``text`` is the scene in TOML, ``data`` its physical data that do not vary."""
+    """A checked scene; ``text`` is the scene in TOML, ``data`` its physical data that do not vary, ``parts`` the names of
+    the elements of a chain."""
 
     title: str
     text: str
     data: Mapping[str, Any] = field(default_factory=dict)
+    parts: tuple[str, ...] = ()
+
+    @cached_property
+    def dimensions(self) -> tuple[Dimension, ...]:
+        """Dimensions of the results besides those of the sweep; those of the elements have the names of the parts."""
+        labels = tuple(f"{i} {name}".rstrip() for i, name in enumerate(self.parts, 1))
+        named = labels and self.system.state_axis is not None
+        return tuple(replace(d, values=labels) if named and d.name in _OF_ELEMENTS else d for d in super().dimensions)
 
 
 def result_variables(problem: Problem) -> tuple[Variable, ...]:
@@ -128,6 +139,7 @@ class _SceneTable(msgspec.Struct, forbid_unknown_fields=True):
     system: str
     analysis: str
     title: str = ""
+    parts: list[str] = []
     outputs: list[str] | None = None
     axes: dict[str, Any] = {}
     points: dict[str, Any] = {}
@@ -157,7 +169,10 @@ def load_scene(source: str | Path | Mapping[str, Any] | Scene, overrides: Mappin
     axes, given, data = with_parameters(system, swept, zipped, _given(table, system, swept))
     fixed = _fixed(system, analysis, axes, given, "points" if table.points else "axes")
     title = table.title or f"{system.title}: {analysis.title}"
-    scene = Scene(system, analysis, request, axes, zipped, fixed, title, text, data)
+    scene = Scene(system, analysis, request, axes, zipped, fixed, title, text, data, tuple(table.parts))
+    lengths = {len(value) for value in fixed.values() if isinstance(value, tuple)} - {0}
+    if table.parts and system.state_axis and len(table.parts) not in lengths:
+        raise InputError(f"parts = {shown(table.parts)}: expected one name per element, {max(lengths, default=0)}")
     if several := next((axis for axis in axes if axis.also and analysis.continuous), None):
         names = " and ".join(part.name for part in several.together)
         others = ", ".join(axis.name for axis in several.also)

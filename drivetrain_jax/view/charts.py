@@ -523,7 +523,7 @@ def entry_name(dimension: str, entry: object) -> str:
     """``driving shaft`` for a named entry of a dimension, ``shaft 1`` for a numbered one, ``carrier`` for a body."""
     if dimension == "body":
         return str(entry)
-    return f"{entry} {dimension}" if isinstance(entry, str) else f"{dimension} {entry}"
+    return f"{dimension} {entry}" if str(entry)[:1].isdigit() else f"{entry} {dimension}"
 
 
 def _draw_threshold(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Line2D]:

@@ -85,6 +85,18 @@ def test_damaged_files_and_wrong_names_are_refused(files, tmp_path, capsys):
     assert not list(tmp_path.glob("r.*"))
 
 
+def test_the_chain_of_a_driveline_is_drawn_with_the_names_of_its_parts(tmp_path):
+    fixed = {"beta": ["8 deg", 0.0, "20 deg"], "phase": [0.0, 0.0, "90 deg"], "ratio": [1, 1, "11/41"]}
+    scene = {"system": "driveline", "analysis": "phasing", "parts": ["front", "<b>rear", "axle"], "fixed": fixed}
+    dt.run(scene, out=tmp_path / "chain.nc")
+    page = Page(report([tmp_path / "chain.nc"]))
+    assert page.count["svg"] == 2 and "b" not in page.count
+    # A joint of no angle and a gear of ratio 1 are not drawn.
+    drawn = {"front", "8 deg", "<b>rear", "axle", "20 deg", "phase 90 deg", "0.268293"}
+    assert drawn | {"1 front", "2 <b>rear", "3 axle"} <= set(page.words)
+    assert not {"0 deg", "phase 0 deg"} & set(page.words)
+
+
 def test_ranges_of_a_chart_hold_for_all_other_values():
     said = statements(_described(results.chart()))
     dataset = results.chart()

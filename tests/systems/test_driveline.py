@@ -503,11 +503,15 @@ half shafts,30,0,600,80000,20,0,0,11/41
 
 
 def test_a_table_of_parts_is_a_driveline(tmp_path):
-    """One row a part in an engineer's units; the column of names is for the reader."""
+    """One row a part in an engineer's units, with its name."""
     path = tmp_path / "truck.csv"
     path.write_text(TRUCK)
     data = read_table(path)
-    assert "part" not in data
+    assert data["parts"] == ["front tube", "rear tube", "pinion", "half shafts"]
+    phases = dt.point("driveline", "phasing", material="steel", **data)
+    assert phases.labels["joint"] == ("1 front tube", "2 rear tube", "3 pinion", "4 half shafts")
+    with pytest.raises(dt.InputError, match=r"parts = \['tube'\]: expected one name per element, 4"):
+        dt.point("driveline", "phasing", material="steel", **{**data, "parts": ["tube"]})
     found = dt.point("driveline", "modes", material="steel", **data)
     g = 2.1e11 / 2.6
     tube = g * math.pi / 32 * (0.0635**4 - 0.060**4) / 1.3
