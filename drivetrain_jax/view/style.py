@@ -12,13 +12,15 @@ import tomllib
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import zip_longest
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError, shown
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 # Passed to rc_context around every figure; global rcParams stay unchanged.
 STYLE: dict[Any, Any] = {

@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax.analysis.critical_speeds.analysis import required_margin
-from drivetrain_jax.runs.reply import growth
+from drivetrain_jax.runs.reply import growth_of
 from tests.oracles.bicardan_reference import finite_elements
 
 
-def test_growth_follows_an_exponential():
-    """x = exp(a t) with a = 0.7 and -0.7 1/s, multiplier over a period of 0.3 s, a turn of 0.6 s."""
-    a, period, turn = np.array([0.7, -0.7]), 0.3, 0.6
-    found = growth(np.exp(a * period), period, turn)
-    np.testing.assert_allclose(found.rate, a, rtol=1e-14)
-    np.testing.assert_allclose(found.per_turn, np.exp(a * turn), rtol=1e-14)
-    np.testing.assert_allclose(np.exp(a[0] * found.time_to_double[0]), 2.0, rtol=1e-14)
-    np.testing.assert_allclose(np.exp(a[1] * found.time_to_halve[1]), 0.5, rtol=1e-14)
-    np.testing.assert_allclose(found.turns_to_double[0] * turn, found.time_to_double[0], rtol=1e-14)
-    assert np.isinf(found.time_to_double[1]) and np.isinf(found.turns_to_halve[0])
+@pytest.mark.parametrize("a", [0.7, -0.7])
+def test_growth_follows_an_exponential(a):
+    """x = exp(a t) [1/s] of a shaft at 100 rpm: a period of 0.3 s, a turn of 0.6 s."""
+    rates = growth_of(dt.Cardan, {}, {"spectral_radius": np.exp(a * 0.3)}, 100.0)
+    way, factor = ("double", 2.0) if a > 0 else ("halve", 0.5)
+    assert rates.keys() == {"rate", "per_turn", f"time_to_{way}", f"turns_to_{way}"}
+    np.testing.assert_allclose([rates["rate"], rates["per_turn"]], [a, np.exp(a * 0.6)], rtol=1e-14)
+    np.testing.assert_allclose(np.exp(a * rates[f"time_to_{way}"]), factor, rtol=1e-14)
+    np.testing.assert_allclose(rates[f"turns_to_{way}"] * 0.6, rates[f"time_to_{way}"], rtol=1e-14)
 
 
 def test_neither_growth_nor_an_immediate_end_divides_by_zero():
-    found = growth([1.0, 0.0, np.nan], 1.0, 1.0)
-    assert np.isinf(found.time_to_double[0]) and np.isinf(found.time_to_halve[0]) and found.time_to_halve[1] == 0.0
-    assert np.isnan(found.rate[2]) and np.isnan(found.time_to_double[2]) and np.isnan(found.turns_to_halve[2])
+    known = [growth_of(dt.Cardan, {}, {"spectral_radius": x}, 100.0) for x in (1.0, 0.0, np.nan)]
+    assert known == [{}, {"per_turn": 0.0, "time_to_halve": 0.0, "turns_to_halve": 0.0}, {}]
 
 
 def test_required_margin_of_api_617():

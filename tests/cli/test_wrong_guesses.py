@@ -134,7 +134,7 @@ GUESSES = [
     (f"{RUN} --set outputs=verdict,radius", "'radius' is not a result of floquet (did you mean spectral_radius?)"),
     (f"{RUN} --set fixed.damping=0.1", "did you mean c1 or c2 or zeta or alpha?"),
     (POINT.replace("beta=0.3", "beta=17,2deg"), "did you mean 17.2?"),
-    (POINT.replace("beta=0.3", "beta=0.1:0.3"), "a range, where one number is needed"),
+    (POINT.replace("beta=0.3 Omega=1.4", "beta=0.1:0.3 Omega=1:2"), "Omega = [1.0, 2.0]: expected a number"),
     (POINT.replace("mu=1", "mu=1/2"), "a quotient is written as a number: 0.5"),
     (POINT.replace("mu=1", "mu=0/0"), "mu = '0/0': "),
     (POINT.replace("mu=1", "mu=1.2.3/4"), "mu = '1.2.3/4': "),

@@ -67,12 +67,16 @@ class Mathieu(System):
         return FloquetModel(natural=form, reduced=form)
 
 
+@pytest.fixture(autouse=True)
+def registered(monkeypatch):
+    """Register the system of this folder for each test; a fixture of the session would leave it to the next folder."""
+    monkeypatch.setitem(systems._REGISTERED, "mathieu", Mathieu)
+
+
 @pytest.fixture(scope="session")
 def atlases(tmp_path_factory):
     """A function of a name of `SCENES`: the atlas, computed once. Files stand in ``folder`` under their names."""
     found, folder = {}, tmp_path_factory.mktemp("atlases")
-    patch = pytest.MonkeyPatch()
-    patch.setitem(systems._REGISTERED, "mathieu", Mathieu)
 
     def atlas(name: str):
         if name not in found:
@@ -88,8 +92,7 @@ def atlases(tmp_path_factory):
         return found[name]
 
     atlas.folder = folder  # pyright: ignore[reportFunctionMemberAccess]
-    yield atlas
-    patch.undo()
+    return atlas
 
 
 def node(*arguments: Any) -> Any:

@@ -14,9 +14,11 @@ def toys(monkeypatch):
     """Register the toy system and its analyses under their names."""
     import toy
 
+    from drivetrain_jax import systems
+
     monkeypatch.setitem(os.environ, "DRIVETRAIN_JAX_CACHE", "0")
     # A pickled job registers the class of its system.
-    monkeypatch.setattr("drivetrain_jax.systems._REGISTERED", {})
+    monkeypatch.setattr(systems, "_REGISTERED", dict(systems._REGISTERED))
     toy.names(monkeypatch.setattr)
 
 

@@ -57,12 +57,12 @@ def test_another_computation_has_another_digest(other):
 
 
 @pytest.mark.parametrize("method", ["direct", "atlas"])
-def test_a_job_is_equal_to_its_pickled_copy(method):
+def test_a_pickled_job_keeps_its_digest(method):
     axes = {"beta": {"start": 0.0, "stop": 1.0, "num": 3}, "Omega": {"start": 1.0, "stop": 2.0, "num": 3}}
     scene = {"system": "cardan", "analysis": "floquet", "axes": axes, "fixed": CARDAN}
     job, other = (resolve(load_scene(scene | {"options": {"method": m}})) for m in (method, "diffrax"))
     copy = pickle.loads(pickle.dumps(job))
-    assert copy == job and hash(copy) == hash(job) and len({job, copy, other}) == 2
+    assert copy.digest == job.digest != other.digest
     assert copy.scene.text == job.scene.text and copy.route.name == job.route.name
 
 

@@ -138,8 +138,8 @@ def test_determinant_against_quadrature():
 @pytest.mark.parametrize(
     ("analysis", "given", "message"),
     [
-        ("history", {"equation": "26"}, "equation = '26'.* input element is 25 or 29"),
-        ("floquet", {"equation": "25"}, "equation = '25'.* input element is 29"),
+        ("history", {"equation": "26"}, "equation = '26': expected 25 or 29 .*of the input element"),
+        ("floquet", {"equation": "25"}, "equation = '25': expected 29 .*of the input element"),
         ("floquet", {"chi_n": 0.0026, "chi_source": "printed_value"}, "chi_n = 0.0026: given together with chi_source"),
         ("floquet", {"beta": math.pi / 2}, "beta = 1.57"),
         ("floquet", {"zeta": 0.0}, "zeta = 0.0: expected 0 < zeta"),
