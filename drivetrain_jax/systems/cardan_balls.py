@@ -15,7 +15,7 @@ _BITS, _TERMS, _RATIO, _LARGEST = 192, 48, 4.0, 6.0
 
 def propagator(values: Mapping[str, float], middle: Mapping[str, float]) -> Any:
     """An ``arb_mat`` that contains T Phi S, eq. (15), at the stored binary64 ``values`` of all parameters."""
-    from flint import acb, arb, arb_mat, arb_series, ctx  # pyright: ignore[reportMissingImports]
+    from flint import acb, arb, arb_mat, arb_series, ctx
 
     ctx.prec, ctx.cap = _BITS, _TERMS + 1
     c, s, i = arb(values["beta"]).cos(), 1 / arb(values["Omega"]), acb(0, 1)
