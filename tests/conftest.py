@@ -46,6 +46,8 @@ def pytest_configure(config):
             shutil.rmtree(compiled)
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(compiled))
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.05")
+    # Two processes use both cores: a second thread of BLAS only waits for the first one, and spins meanwhile.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Nobody reads where the operations of a test come from: 2.5 % of tracing and compiling.
     os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
     # Traces leave many objects and hardly any garbage.

@@ -61,6 +61,7 @@ def test_solves_are_optimised_only_where_they_are_nodes(slowest, change, toleran
     assert method_of_solves(CARDAN, ranges, fixed, tolerance) == expected
 
 
+@pytest.mark.full
 def test_a_march_is_traced_once_for_the_solves_of_an_atlas():
     ranges = {"beta": (0.0, 1.5), "Omega": (0.1, 2.0)}
     axes = {name: {"start": low, "stop": high} for name, (low, high) in ranges.items()}

@@ -50,6 +50,7 @@ def test_a_swallowed_interrupt_is_raised_again_and_not_reported(monkeypatch):
     assert sys.unraisablehook.__self__ is reported
 
 
+@pytest.mark.full
 def test_an_interrupt_in_a_callback_of_jax_stops_python(tmp_path):
     sent = []
 

@@ -273,6 +273,7 @@ def test_a_part_without_extent_is_drawn():
     assert (drawn["verdict"].values == 0).all() and drawn["tip"].size == 0
 
 
+@pytest.mark.full
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_range_of_speeds_without_extent_has_a_widest_angle():
     atlas = dt.open_atlas(panels((0.0, 1.5), (0.1, 2.0)))
