@@ -8,13 +8,20 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+# Pieces that are waiting, over the number of threads.
+_AHEAD = 2
+
+_Piece = TypeVar("_Piece")
+_Done = TypeVar("_Done")
 
 
 @lru_cache
@@ -79,6 +86,25 @@ def threads(count: int, name: str) -> ThreadPoolExecutor:
     Do not shut them down.
     """
     return ThreadPoolExecutor(count, thread_name_prefix=name, initializer=in_double_precision)
+
+
+def in_threads(pieces: Iterable[_Piece], work: Callable[[_Piece], _Done]) -> Iterator[tuple[_Piece, _Done]]:
+    """Yield every piece with ``work(piece)``, in order, computed on all cores; pieces are created on demand."""
+    count = usable_cores()
+    pool = threads(count, "piece")
+    pending: deque[tuple[_Piece, Future[_Done]]] = deque()
+    try:
+        for piece in pieces:
+            pending.append((piece, pool.submit(work, piece)))
+            if len(pending) > _AHEAD * count:
+                done, results = pending.popleft()
+                yield done, results.result()
+        while pending:
+            done, results = pending.popleft()
+            yield done, results.result()
+    finally:
+        for _, results in pending:
+            results.cancel()
 
 
 def in_double_precision() -> None:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._machine import threads, usable_cores
+from drivetrain_jax._machine import in_threads
 from drivetrain_jax.analysis import Outcome
 from drivetrain_jax.analysis.floquet import quartic
 from drivetrain_jax.analysis.floquet.quartic import EPS, Blocks, determinant, square_norm, transposed_product
@@ -63,8 +61,6 @@ def verdict(phi: Blocks, value_error: Array) -> Array:
 
 # Most rows and columns of a tile. The columns of a row are the lanes of all loops; XLA computes so short a row in one task.
 ROWS, COLUMNS = 64, 512
-# Tasks per core that are queued.
-_AHEAD = 2
 UNDECIDED = 2
 # Factor by which interpolation between nodes may amplify rounding: the Lebesgue constant of 24 nodes is 2.99.
 _SPREAD = 3.0
@@ -72,8 +68,6 @@ _SPREAD = 3.0
 Build = Callable[[Mapping[str, Any]], FloquetModel]
 # Results of cells by name, and flags of the cells to compute again by eigenvalues (`results_of_coefficients`).
 Cells = dict[str, np.ndarray]
-T = TypeVar("T")
-R = TypeVar("R")
 
 
 def evaluated_tiles(
@@ -102,25 +96,6 @@ def evaluated_tiles(
         return {name: np.asarray(x)[:rows, :columns] for name, x in cells_of_tile.items()}
 
     return in_threads(tiles, work)
-
-
-def in_threads(pieces: Iterable[T], work: Callable[[T], R]) -> Iterator[tuple[T, R]]:
-    """Yield every piece with ``work(piece)``, in order, computed on all cores; pieces are created on demand."""
-    count = usable_cores()
-    pool = threads(count, "tile")
-    pending: deque[tuple[T, Future[R]]] = deque()
-    try:
-        for piece in pieces:
-            pending.append((piece, pool.submit(work, piece)))
-            if len(pending) > _AHEAD * count:
-                done, results = pending.popleft()
-                yield done, results.result()
-        while pending:
-            done, results = pending.popleft()
-            yield done, results.result()
-    finally:
-        for _, results in pending:
-            results.cancel()
 
 
 @lru_cache(maxsize=32)

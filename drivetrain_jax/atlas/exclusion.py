@@ -38,7 +38,6 @@ class Search:
     """
 
     patches: Patches
-
     points: np.ndarray
     curvature: np.ndarray
     slope: np.ndarray

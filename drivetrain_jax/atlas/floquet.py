@@ -13,11 +13,10 @@ import jax
 import numpy as np
 from jax import Array
 
-from drivetrain_jax._machine import compiling, threads
+from drivetrain_jax._machine import compiling, in_threads, threads
 from drivetrain_jax.analysis.floquet.effort import panels_needed, stable_steps, steps_needed
 from drivetrain_jax.analysis.numerics.collocation import propagators_along
 from drivetrain_jax.analysis.numerics.kernels import Words, compiler_options, predicted, split
-from drivetrain_jax.atlas.charts import in_threads
 from drivetrain_jax.atlas.construction import FIRST_GIVEN, MAX_SOLVES, Axes, Domain, Function, construct
 from drivetrain_jax.atlas.panels import Atlas, Panel
 from drivetrain_jax.atlas.stability import StabilityAtlas

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial.chebyshev import chebder
 
-from drivetrain_jax.atlas.charts import in_threads
+from drivetrain_jax._machine import in_threads
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes, on_grid, restriction, slabs
 from drivetrain_jax.atlas.panels import Panel, chebyshev, grid_positions, position_between
@@ -26,7 +26,7 @@ NODES = 16
 _TAIL = 3e-14
 _ROUNDING = 1e6
 _MAX_PATCHES = 8_000
-# Patches at first along a coordinate over the degree of the panel, of which the functions have four times as much.
+# Patches at first along a coordinate, as a part of the panel's degree; the functions have four times that degree.
 _FIRST = 1 / 3
 # Points whose errors are computed together (small enough for the cache).
 _TOGETHER = 1 << 14
@@ -264,6 +264,7 @@ def _sample(criteria: Criteria, panel: Panel, counts: list[int]) -> _Sample:
             values = _apply(analysis_matrix(NODES), values, axis)
         return values
 
+    # Whole patches: the errors contain one largest value for all points that are computed together.
     rows = NODES * max(1, _TOGETHER // (NODES * phi[0, 0].size))
     parts = [slice(start, start + rows) for start in range(0, phi.shape[1], rows)]
     bounds = in_threads(parts, lambda part: criteria.errors(panel, phi[:, part], log_determinant[part]))

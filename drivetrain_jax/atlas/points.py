@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from drivetrain_jax._machine import in_threads
 from drivetrain_jax.analysis.floquet import quartic
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, in_one_kernel, options_for_few
-from drivetrain_jax.atlas.charts import Build, Cells, exact_verdict, in_threads, results_of_coefficients
+from drivetrain_jax.atlas.charts import Build, Cells, exact_verdict, results_of_coefficients
 from drivetrain_jax.atlas.interpolation import restriction
 from drivetrain_jax.atlas.panels import Atlas, Panel, position
 

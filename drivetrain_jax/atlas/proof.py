@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.polynomial.chebyshev import chebvander
 
-from drivetrain_jax.atlas.charts import in_threads
+from drivetrain_jax._machine import in_threads
 from drivetrain_jax.atlas.construction import Domain
 from drivetrain_jax.atlas.floquet import floquet_domain, middle_of, smoothness
 from drivetrain_jax.atlas.panels import Atlas, Panel

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,6 +22,7 @@ from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.physical import PARTS, described, read_table
 from drivetrain_jax.runs.reply import (
+    EVEN,
     Limit,
     Reply,
     differentiable,
@@ -32,10 +32,12 @@ from drivetrain_jax.runs.reply import (
     point_sensitivities,
     speed_in_rpm,
     verdict_words,
+    with_unstable_ranges,
 )
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import Scene, load_scene
 from drivetrain_jax.systems import get_system
+from drivetrain_jax.systems._base import RPM
 from drivetrain_jax.view.style import in_units, ranges_text, runs_text, units_of, unstable_text
 
 
@@ -285,14 +287,13 @@ def _varied(system: str, analysis: str, given: Mapping[str, Any]) -> str | None:
 
 def _least_stable(system: str, name: str, given: Mapping[str, Any], asked: Mapping[str, Any]) -> PointResult:
     """The point of the largest spectral radius in the range of ``name``, and the unstable ranges as its sentence."""
-    from drivetrain_jax.runs.reply import with_unstable_ranges
     from drivetrain_jax.runs.run import run
 
     low, high = map(toml.plain, given[name])
     given = {n: value for n, value in given.items() if n != name}
     tree = _tree(system, "floquet", {n: toml.plain(value) for n, value in given.items()})
     fixed = tree["fixed"] | {n: value for n, (value,) in tree.pop("points").items()}
-    axes = {name: {"start": low, "stop": high, "num": _RANGE}}
+    axes = {name: {"start": low, "stop": high, "num": EVEN}}
     dataset = run(tree | {"fixed": fixed, "axes": axes, "outputs": ["spectral_radius", "verdict"]})
     unit = next((parts[1] for end in (low, high) if isinstance(end, str) and (parts := _units.split(end))), "")
     dataset, worst = with_unstable_ranges(dataset)
@@ -392,12 +393,10 @@ def _result(job: Job) -> PointResult:
         advice=scene.analysis.advice(scene.request),
         growth=grows,
         orders=orders,
-        sentence=sentence or (orders.sentence(values, ordered) if orders else ""),
+        sentence=sentence or (_about(orders, values, ordered) if orders else ""),
     )
 
 
-# First samples of a range.
-_RANGE = 91
 # Digits of given values in an answer.
 _PROSE = 6
 # Most modes in the sentence about an order, and speeds of one kind in that about whirl.
@@ -428,19 +427,17 @@ class OrderCrossings:
         how = ", with the gyroscopic effect" if self.turning else ""
         return [f"  speed of the {self.orders.shaft} at which an order meets the mode{how}", *aligned([head, *modes])]
 
-    def sentence(self, values: Mapping[str, Any], parameters: Mapping[str, Any]) -> str:
-        """Whirl at the speed of the ``parameters`` and critical speeds; of other ``values`` the speeds within the operating
-        range or the first ones, and the modes too near to that range."""
-        if "whirl_frequency" in values:
-            codes, turns = values.get("whirl_direction"), values["whirl_frequency"] * 60 / (2 * math.pi)
-            senses = (
-                {} if codes is None else {"backward at": codes == 0, "forward at": codes == 2, "planar at": codes == 1}
-            )
-            said = [f"{sense} {_first(turns[which])}" for sense, which in senses.items() if np.any(which)]
-            critical = [f"of {name}: {_first(column)}" for name, column in self.columns.items() if np.any(column > 0)]
-            speed = parameters.get("speed", 0.0) * 60 / (2 * math.pi)
-            whirl = f"At {speed:.6g} rpm the shaft whirls {', '.join(said) or f'at {_first(turns)}'}"
-            return f"{whirl}; critical speeds {'; '.join(critical)}." if critical else f"{whirl}."
+    def whirl_sentence(self, values: Mapping[str, Any], speed: float) -> str:
+        """Frequencies of whirl at the ``speed`` [rad/s] of the shaft, by their sense, and critical speeds."""
+        codes, turns = values.get("whirl_direction"), values["whirl_frequency"] / RPM
+        senses = {} if codes is None else {"backward at": codes == 0, "forward at": codes == 2, "planar at": codes == 1}
+        said = [f"{sense} {_first(turns[which])}" for sense, which in senses.items() if np.any(which)]
+        critical = [f"of {name}: {_first(column)}" for name, column in self.columns.items() if np.any(column > 0)]
+        whirl = f"At {speed / RPM:.6g} rpm the shaft whirls {', '.join(said) or f'at {_first(turns)}'}"
+        return f"{whirl}; critical speeds {'; '.join(critical)}." if critical else f"{whirl}."
+
+    def sentence(self, values: Mapping[str, Any]) -> str:
+        """The speeds within the operating range, or the first ones, and the modes of ``values`` too near to that range."""
         if not self.operating:
             (name, column), *_ = self.columns.items()
             met = [f"mode {k + 1} at {column[k]:.6g} rpm" for k in np.flatnonzero(np.isfinite(column))]
@@ -453,6 +450,13 @@ class OrderCrossings:
             modes = f"mode{'s' * (len(near) > 1)} {', '.join(map(str, near))}"
             said += [f"{modes} lack{'s' * (len(near) == 1)} the required separation margin"] if len(near) else []
         return f"{'; '.join(said)}."
+
+
+def _about(orders: OrderCrossings, values: Mapping[str, Any], parameters: Mapping[str, Any]) -> str:
+    """The sentence about whirl at the speed of the ``parameters``, or about the modes."""
+    if "whirl_frequency" in values:
+        return orders.whirl_sentence(values, parameters.get("speed", 0.0))
+    return orders.sentence(values)
 
 
 def order_crossings(scene: Scene, parameters: Mapping[str, Any], values: Mapping[str, Any]) -> OrderCrossings | None:

@@ -360,7 +360,7 @@ def radius_gradient(system: type[System], values: Mapping[str, float]) -> dict[s
 
 
 # Samples of a range of speeds: evenly spaced, and halving distances from both ends, where a resonance may lie.
-_EVEN, _HALVINGS = 91, range(8, 22)
+EVEN, _HALVINGS = 91, range(8, 22)
 # Points and rounds by which peaks and crossings of the limit are refined.
 _PARTS, _PEAK_ROUNDS, _LIMIT_ROUNDS, _VERDICT_ROUNDS = 9, 2, 3, 5
 # Part of the middle of an unstable range up to which a predicted resonance belongs to it.
@@ -434,7 +434,7 @@ def _sampled(
     to places where the largest of k crosses ``limit``."""
     steps = (high - low) * 0.5 ** np.array(_HALVINGS)
     likely = likely[(likely > low) & (likely < high)]
-    x = np.unique(np.concatenate([np.linspace(low, high, _EVEN), low + steps, high - steps, likely]))
+    x = np.unique(np.concatenate([np.linspace(low, high, EVEN), low + steps, high - steps, likely]))
     y = function(x)
     for _ in range(_PEAK_ROUNDS):
         size = np.max(y, axis=1)
