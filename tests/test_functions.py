@@ -354,6 +354,7 @@ def test_registered_classes_are_known_by_name(tmp_path, monkeypatch):
             dt.register(wrong)
 
 
+@pytest.mark.full
 def test_a_sweep_of_an_unregistered_class_has_the_dimensions_of_its_analysis():
     class Falling(System):
         name, title, time_units = "falling", "y'' = -g", "s"

@@ -82,11 +82,14 @@ def cases(count):
     }
 
 
+EVERY_WAY = [{"method": "direct"}, {"method": "diffrax"}, {"method": "diffrax", "form": "published"}]
+
+
 @pytest.mark.parametrize(
-    "options", full_after(1, [{"method": "direct"}, {"method": "diffrax"}, {"method": "diffrax", "form": "published"}])
+    ("options", "count"), full_after(1, [(EVERY_WAY[0], 4), *((way, 24) for way in EVERY_WAY)], several=True)
 )
-def test_meissners_equation_has_its_closed_form(options):
-    values = cases(24)
+def test_meissners_equation_has_its_closed_form(options, count):
+    values = cases(count)
     found = jax.vmap(lambda own: dt.floquet(Meissner(**own), outputs=OUTPUTS, rtol=1e-12, **options).variables)(values)
     exact = np.array([closed_form(*row) for row in zip(*values.values(), strict=True)])
     radius = abs(exact[:, 0])

@@ -119,6 +119,7 @@ def test_discs_springs_and_segments_without_mass(name):
     assert np.all(distance <= 1e-14) and np.all(distance <= error[zeros:present])
 
 
+@pytest.mark.full
 def test_a_disc_in_closed_form():
     """One on a cantilever without mass: (p^2 m - 12 EI/l^3)(p^2 I - 4 EI/l) = (6 EI/l^2)^2."""
     EI, length, mass, inertia = 3e3, 0.7, 12.0, 0.35

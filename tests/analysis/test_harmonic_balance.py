@@ -240,6 +240,7 @@ def test_subharmonics_follow_a_doubled_period():
     assert (np.asarray(found["stability"]) == 0).all()
 
 
+@pytest.mark.full
 def test_a_lane_does_not_depend_on_the_others():
     """The length and steps of the integration depend on the lane alone, also after a sweep has lost its motion."""
     omegas = np.array([0.7, 0.8, 0.9])

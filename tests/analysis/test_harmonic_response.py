@@ -37,6 +37,7 @@ def forces(torques: dict[str, float]) -> np.ndarray:
     return force
 
 
+@pytest.mark.full
 def test_it_is_the_dense_solution():
     damping, torques = 0.03, {"T_s": 10.0, "T_c": -5.0}
     gear = dt.Planetary(planet_angle=ANGLES, **ERRORS, **torques)

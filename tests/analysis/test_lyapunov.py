@@ -125,6 +125,7 @@ def test_linear_oscillator_under_constant_torque_stands_still(linear_motions):
     assert linear_motions["verdict"][0] == Verdict.FIXED_POINT
 
 
+@pytest.mark.full
 def test_degenerate_pair_is_still_a_fixed_point(linear_motions):
     """A complex pair has a double exponent, that of its orbit; averages would have two values with the exact sum."""
     ours, error = (linear_motions[name][:, 1] for name in ("lyapunov_spectrum", "lyapunov_standard_error"))
@@ -133,6 +134,7 @@ def test_degenerate_pair_is_still_a_fixed_point(linear_motions):
     assert linear_motions["verdict"][1] == Verdict.FIXED_POINT
 
 
+@pytest.mark.full
 def test_what_leaves_all_bounds_is_unstable_and_stops_nobody(linear_motions):
     assert linear_motions["verdict"][3] == Verdict.PARAMETRICALLY_UNSTABLE
     assert np.isnan(linear_motions["lyapunov_standard_error"][:, 3]).all()
@@ -369,6 +371,7 @@ def test_a_double_multiplier_is_no_instability(max_time):
     assert (ours.outcome == Outcome.SUCCESS).all()
 
 
+@pytest.mark.full
 def test_members_do_not_depend_on_their_neighbours(linear, linear_motions):
     """The slow member runs to the end and the others stop earlier; among equal members its results are the same."""
     alike = linear([0.01] * 4, [1.0] * 4)

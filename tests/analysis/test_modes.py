@@ -54,6 +54,7 @@ def test_random_spacings_have_the_right_count_of_planet_modes(n):
         )
 
 
+@pytest.mark.full
 def test_labels_of_five_planets():
     """Random changes of 1e-9 to 1e-12 rad around equal and around balanced unequal spacing flip no label.
 

@@ -89,6 +89,7 @@ def test_values_that_miss_their_target_are_counted(cli, store, out):
     assert text.endswith("2 without a value\n  not_finite: 2\n  tolerance_not_met: 2, with a value\n")
 
 
+@pytest.mark.full
 def test_the_worst_value_that_misses_its_tolerance_is_shown(cli):
     """Two multipliers nearly coincide at this point, which limits the accuracy of both."""
     fixed = {"zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}

@@ -31,6 +31,14 @@ class Interrupted:
             pass
 
 
+@pytest.fixture(autouse=True)
+def interrupts():
+    """The handler of an interactive shell; a program that a script starts in the background ignores interrupts."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 class Broken:
     def __del__(self):
         raise ZeroDivisionError

@@ -188,7 +188,7 @@ HOW = {"deadline": None, "suppress_health_check": list(HealthCheck), "database":
 @pytest.mark.parametrize("machine", full_after(1, [ResumeMachine, StoreMachine]))
 def test_no_order_of_events_gives_a_wrong_value(machine):
     pytest.importorskip("zarr")
-    short = settings(max_examples=5, stateful_step_count=10, derandomize=True, **HOW)
+    short = settings(max_examples=3, stateful_step_count=10, derandomize=True, **HOW)
     run_state_machine_as_test(machine, settings=short)
 
 

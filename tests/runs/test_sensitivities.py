@@ -12,6 +12,7 @@ import drivetrain_jax as dt
 from drivetrain_jax.cli import main
 from drivetrain_jax.runs import atlas_answers
 from tests.atlases import stored_atlas
+from tests.sizes import full_after
 
 DATA = {"J1": 2.0, "J2": 0.5, "k1": 6e4, "k2": 4e4, "c1": 0.3464, "c2": 0.1414, "angle": 12.0}
 SCENE = {"system": "cardan", "analysis": "atlas", "fixed": DATA}
@@ -129,23 +130,16 @@ LINE = {"speed": 100.0, "k": [1e4, 2e4], "c": [0.1, 0.1], "J": [0.1, 1.0]}
 SHAFT = {"length": [0.3, 0.9], "outer_diameter": [0.06, 0.08], "inner_diameter": [0.0, 0.07], "material": "steel"}
 OF_ANALYSES = [
     ("driveline", "modes", "natural_frequency", LINE, ("k[1]", "J[0]")),
-    pytest.param(
+    (
         *("bicardan", "critical_speeds", "critical_speed", SHAFT | {"k_A": 5e6, "k_D": 5e6, "modes": 2}),
         ("outer_diameter[1]", "length[0]", "k_A"),
-        marks=pytest.mark.full,
     ),
-    pytest.param(
-        "cardan", "forced", "amplitude", DATA | {"speed": 1200.0}, ("angle", "speed", "k2"), marks=pytest.mark.full
-    ),
-    pytest.param(
-        *("rattle", "steady_state", "u_max", dt.Rattle.presets["table1"] | {"omega": 0.7}),
-        ("omega", "B1"),
-        marks=pytest.mark.full,
-    ),
+    ("cardan", "forced", "amplitude", DATA | {"speed": 1200.0}, ("angle", "speed", "k2")),
+    ("rattle", "steady_state", "u_max", dt.Rattle.presets["table1"] | {"omega": 0.7}, ("omega", "B1")),
 ]
 
 
-@pytest.mark.parametrize(("system", "analysis", "output", "given", "names"), OF_ANALYSES)
+@pytest.mark.parametrize(("system", "analysis", "output", "given", "names"), full_after(1, OF_ANALYSES, several=True))
 def test_sensitivities_of_any_result_are_central_differences(system, analysis, output, given, names):
     def changed(name, step):
         name, _, entry = name.partition("[")
