@@ -370,6 +370,19 @@ def test_a_sweep_of_an_unregistered_class_has_the_dimensions_of_its_analysis():
     np.testing.assert_allclose(found.height[1], [0.0, -1.0, -4.0], atol=1e-9)
 
 
+def test_what_python_computes_on_the_host_is_never_reused(tmp_path):
+    def times(factor):
+        shape = jax.ShapeDtypeStruct((), float)
+        return lambda p: jax.pure_callback(lambda x: np.asarray(factor * x), shape, p["a"], vmap_method="sequential")
+
+    out = tmp_path / "host.nc"
+    assert swept(times(2.0), out=out)["lambda"].values.tolist() == [0.0, 1.0]
+    assert swept(times(3.0))["lambda"].values.tolist() == [0.0, 1.5]
+    with pytest.raises(dt.InputError, match="the function, an option or a fixed value differs"):
+        swept(times(2.0), out=out)
+    assert swept(times(3.0), out=out, fresh=True)["lambda"].values.tolist() == [0.0, 1.5]
+
+
 def test_an_infinite_result_is_missing_and_codes_are_known():
     found = swept(lambda p: {"r": 1 / p["a"], "n": jnp.int32(3)})
     assert np.isnan(found.r[0]) and found.r[1] == 2.0 and found.n.values.tolist() == [3, 3]
