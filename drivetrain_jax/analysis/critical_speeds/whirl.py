@@ -18,6 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
 
 from drivetrain_jax._quantities import Dimension, Variable, count
 from drivetrain_jax.analysis._base import Analysis, Request, Solver
@@ -82,23 +83,24 @@ def _derivatives(
 ) -> dict[str, Array]:
     q, direction = jnp.sqrt(results["whirl_frequency"]), results["whirl_direction"]
 
-    def build(sense: float, parameters: Any) -> Shaft:
+    def build(sense: ArrayLike, parameters: Any) -> Shaft:
         shaft = system.models["whirl"].build(eqx.combine(parameters, constants.tree))
         return shaft if shaft.spin is None else shaft._replace(spin=sense * shaft.spin)
 
     if build(1.0, parameters).k_y is not None:
         return {"whirl_frequency": frequency_derivatives(partial(build, 1.0), parameters, q)}
 
-    def within(code: int, sense: float) -> Array:
+    def within(sense: Array) -> Array:
         """Derivatives of the modes of one sense, at their places; neighbours of the other sense do not count."""
-        chosen = direction == code
+        chosen = direction == jnp.where(sense < 0, BACKWARD, FORWARD)
         place = jnp.argsort(~chosen, stable=True)
         others = 2 * jnp.max(q, initial=1.0, where=chosen) + jnp.arange(len(q))
         slopes = frequency_derivatives(partial(build, sense), parameters, jnp.where(chosen, q, others)[place])
         return jnp.where(chosen[:, None], slopes[jnp.argsort(place)], 0.0)
 
     still = jnp.where(jnp.isfinite(q) & (q > 0), 0.0, jnp.nan)[:, None]
-    return {"whirl_frequency": within(BACKWARD, -1.0) + within(FORWARD, 1.0) + still}
+    # A loop compiles the derivatives once for both senses.
+    return {"whirl_frequency": jnp.sum(jax.lax.map(within, jnp.array([-1.0, 1.0])), axis=0) + still}
 
 
 ANALYSIS = Analysis(
