@@ -170,11 +170,11 @@ _COMMANDS: dict[str, tuple[str, tuple[Any, ...]]] = {
         *_SCENE,
         ("--fresh", {"action": "store_true", "help": "compute all points again; replace result and unfinished work"}),
         _argument("--threads", "N", "number of threads (default: usable cores)", type=int),
-        _argument("--workers", "N", "N Dask workers instead of threads, as --dask local:N; a worker may crash", type=int),
+        _argument("--workers", "N", "N Dask workers, as --dask local:N; unlike threads, they survive a crash", type=int),
         _argument("--dask", "ADDRESS", "Dask cluster instead of threads: tcp://HOST:PORT or local:N"),
-        _file("--reuse", "FILE.nc", "reuse the common points of this result; a smaller result at --out is always reused",
+        _file("--reuse", "FILE.nc", "reuse common points of this result (repeatable); a smaller one at --out is always used",
               action="append", default=[]),
-        ("--store", {"choices": ("hdf5", "zarr"), "help": "zarr: workers write a Zarr store (default if so named)"}),
+        ("--store", {"choices": ("hdf5", "zarr"), "help": "zarr: a Zarr store (default if --out ends in .zarr)"}),
         ("--quiet", {"action": "store_true", "help": "print only the last line"}),
     )),
     "status": ("show how much of a scene is computed", (*_SCENE, _JSON)),
@@ -205,7 +205,7 @@ _COMMANDS: dict[str, tuple[str, tuple[Any, ...]]] = {
     "point": ("compute one point", (
         _argument("system", "SYSTEM", "name from `drivetrain list`"),
         _argument("analysis", "ANALYSIS", "name from `drivetrain list SYSTEM`"),
-        _given("parameters in the units of `drivetrain list SYSTEM`, options, and outputs=NAME,NAME"),
+        _given("parameters in the units of `drivetrain list SYSTEM` (floquet: or LOW:HIGH), options, outputs=NAME,NAME"),
         _DATA, _AMPLITUDE,
         ("--sensitivities", {
             "action": "store_true", "help": "add the effect of 1 %% of each value on the results, largest first",
