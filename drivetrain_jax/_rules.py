@@ -74,10 +74,6 @@ def in_order(*names: str) -> Rule:
     return Rule(" <= ".join(names), names, broken)
 
 
-# A rule given by its text, variables and function.
-relation = Rule
-
-
 def multiple(name: str, factor: float, of: str) -> Rule:
     """``name = factor * of``."""
     return Rule(f"{name} = {factor:.6g} {of}", (name, of), lambda ds: _differ(ds[name], factor * ds[of]))
@@ -123,8 +119,9 @@ class Declared:
 _ROUNDING = 1e-15
 
 
-def _all_multipliers(compare: Callable[[xr.DataArray, xr.Dataset], xr.DataArray]) -> Callable:
-    return lambda ds: compare(abs(ds["floquet_multiplier"]).max("multiplier"), ds)
+def _radius_differs(ds: xr.Dataset) -> xr.DataArray:
+    largest = abs(ds["floquet_multiplier"]).max("multiplier")
+    return abs(largest - ds["spectral_radius"]) > 1e-9 * largest
 
 
 def _liouville(ds: xr.Dataset) -> xr.DataArray:
@@ -162,7 +159,7 @@ MOTION = (
     within("u_rms", 0.0),
     within("spectral_radius", 0.0),
     within("period_multiple", 0.0),
-    relation("u_rms <= max |u|", ("u_rms", "u_max", "u_min"), _rms_too_large),
+    Rule("u_rms <= max |u|", ("u_rms", "u_max", "u_min"), _rms_too_large),
 )
 
 
@@ -209,17 +206,17 @@ BUILT_IN = {
     "floquet": Declared(
         (
             ordered("floquet_multiplier", "multiplier", falling=True, key=abs),
-            relation(
+            Rule(
                 "spectral_radius is the largest modulus of floquet_multiplier",
                 ("spectral_radius", "floquet_multiplier"),
-                _all_multipliers(lambda top, ds: abs(top - ds["spectral_radius"]) > 1e-9 * top),
+                _radius_differs,
             ),
-            relation(
+            Rule(
                 "verdict follows from spectral_radius and its bound",
                 ("verdict", "spectral_radius", "spectral_radius_error"),
                 _verdict,
             ),
-            relation(
+            Rule(
                 "liouville_residual lies within the bound of spectral_radius",
                 ("liouville_residual", "spectral_radius", "spectral_radius_error"),
                 _liouville,
@@ -271,8 +268,8 @@ BUILT_IN = {
             in_order("branch_u_min", "branch_u_max"),
             within("branch_amplitude", 0.0),
             within("branch_spectral_radius", 0.0),
-            relation("largest branch_amplitude rises along branch", ("branch_amplitude", "outcome"), _branches_fall),
-            relation(
+            Rule("largest branch_amplitude rises along branch", ("branch_amplitude", "outcome"), _branches_fall),
+            Rule(
                 "branch_stability follows from branch_spectral_radius",
                 ("branch_stability", "branch_spectral_radius"),
                 _stability_differs,
@@ -306,7 +303,7 @@ BUILT_IN = {
     "lyapunov": Declared(
         (
             ordered("lyapunov_spectrum", "exponent", falling=True),
-            relation("the exponents sum to the mean divergence", ("sum_rule_residual", "lyapunov_spectrum"), _sum_rule),
+            Rule("the exponents sum to the mean divergence", ("sum_rule_residual", "lyapunov_spectrum"), _sum_rule),
             within("chaos_k01", -1.0, 1.0),
             within("period_multiple", 0.0),
         ),
@@ -345,7 +342,7 @@ BUILT_IN = {
             ordered("natural_frequency", "mode"),
             within("natural_frequency", 0.0),
             multiple("angular_frequency", 2 * math.pi, "natural_frequency"),
-            relation("critical_speed = 60/max(|order|, 1) natural_frequency", _SPEEDS, _speeds_differ),
+            Rule("critical_speed = 60/max(|order|, 1) natural_frequency", _SPEEDS, _speeds_differ),
             within("count_certified", 0.0, 1.0),
             within("mode_shape", -1.0, 1.0),
         ),

@@ -18,7 +18,7 @@ import xarray as xr
 
 from drivetrain_jax._plugins import RULES, call_plugin, load_plugin
 from drivetrain_jax._quantities import FIRST_FAILURE
-from drivetrain_jax._rules import BUILT_IN, Declared, Rule, in_order, multiple, ordered, relation, sums_to_one, within
+from drivetrain_jax._rules import BUILT_IN, Declared, Rule, in_order, multiple, ordered, sums_to_one, within
 from drivetrain_jax.store import checksums, zarr_store
 from drivetrain_jax.store.consolidate import attributes, open_result
 from drivetrain_jax.store.parts import PartsFolder
@@ -33,7 +33,6 @@ __all__ = [
     "in_order",
     "multiple",
     "ordered",
-    "relation",
     "sums_to_one",
     "verify",
     "verify_dataset",
