@@ -20,7 +20,7 @@ from drivetrain_jax.analysis.numerics.kernels import Words, compiler_options, pr
 from drivetrain_jax.atlas.construction import FIRST_GIVEN, MAX_SOLVES, Axes, Domain, Function, construct
 from drivetrain_jax.atlas.panels import Atlas, Panel
 from drivetrain_jax.atlas.stability import StabilityAtlas
-from drivetrain_jax.systems import FloquetModel, LinearPeriodic, Series, Smoothness, System
+from drivetrain_jax.systems import FloquetModel, LinearPeriodic, Smoothness, System
 
 # Ratio of the tolerance of direct solves to that of the atlas, and the smallest tolerance that rounding allows.
 _SOLVES_SHARPER, _FINEST = 3e-2, 1e-13
@@ -52,7 +52,7 @@ def floquet_atlas(
     solve: Callable[[np.ndarray], np.ndarray],
     max_solves: int = MAX_SOLVES,
 ) -> Atlas:
-    """An atlas of the propagator, or of ``T Phi S`` for a system with a :class:`~drivetrain_jax.systems.Balance`.
+    """An atlas of the propagator, or of ``T Phi S`` for a system with a ``balance``.
 
     ``solve(points)`` gives the variables of the analysis ``floquet_propagator`` with ``rtol = solve_rtol(tolerance)`` at
     points in parameters ``(N, d)``, in one array ``(N, 2 n n)``. Errors are relative to the size of the monodromy matrix.
@@ -121,7 +121,7 @@ def balanced_entries(system: type[System], domain: Domain, points: np.ndarray, e
     if (balance := smoothness(system).balance) is None:
         return entries
     values = {**domain.fixed, **dict(zip(domain.parameters, points.T, strict=True))}
-    left, right = (scales.reshape(len(scales), -1).T for scales in balance.scales(values, middle_of(domain)))
+    left, right = (scales.reshape(len(scales), -1).T for scales in balance(values, middle_of(domain)))
     matrices = entries.reshape(len(points), left.shape[1], -1)
     return (left[:, :, None] * matrices * right[:, None]).reshape(entries.shape)
 
@@ -177,20 +177,18 @@ _TOO_FINE, _STIFF = 5e-13, 50
 # Tolerance at which steps are predicted, and the number of panels up to which a small program solves held-out points.
 _STEPS_AT, _CHEAP = 1e-10, 256
 
-Key = tuple[Callable[..., FloquetModel], Series, tuple[str, ...], Words, tuple[tuple[str, tuple[int, ...]], ...]]
+Key = tuple[Callable[..., FloquetModel], str, tuple[str, ...], Words, tuple[tuple[str, tuple[int, ...]], ...]]
 
 
 def series_nodes(system: type[System], domain: Domain, tolerance: float) -> SeriesNodes | None:
     """The source of nodes for ``domain``; None without a series of the system, or if the parts would be too inaccurate."""
     decay = _series_decay(system, domain, tolerance)
-    # Never None if the decay is finite.
-    return SeriesNodes(system, domain, smoothness(system).series, decay, tolerance) if decay <= _STIFF else None  # pyright: ignore[reportArgumentType]
+    return SeriesNodes(system, domain, decay, tolerance) if decay <= _STIFF else None
 
 
 def _series_decay(system: type[System], domain: Domain, tolerance: float) -> float:
     """Most steps of decay in a domain; infinite without a series along it, or for a tolerance too fine for one."""
-    series = smoothness(system).series
-    if series is None or series.parameter not in domain.parameters or tolerance < _TOO_FINE:
+    if smoothness(system).series not in domain.parameters or tolerance < _TOO_FINE:
         return math.inf
     return float(np.max(predicted(_stable_steps, (system.models["floquet"].build,), _corners(domain))))
 
@@ -208,9 +206,9 @@ def _stable_steps(build: Callable[..., FloquetModel], values: Any) -> Array:
 class SeriesNodes:
     """Propagators on grids of coordinates, in lines along the coordinate of the series."""
 
-    def __init__(self, system: type[System], domain: Domain, series: Series, decay: float, tolerance: float) -> None:
-        self._system, self._domain, self._series = system, domain, series
-        self.axis = domain.parameters.index(series.parameter)
+    def __init__(self, system: type[System], domain: Domain, decay: float, tolerance: float) -> None:
+        self._system, self._domain, self._series = system, domain, smoothness(system).series
+        self.axis = domain.parameters.index(self._series)
         target = max(_SHARPER * tolerance, _LEAST)
         # Limit of the last kept term; the truncated terms are far smaller.
         self._left_out = 10 * target
@@ -218,9 +216,9 @@ class SeriesNodes:
         self._least = 1 + math.ceil(_DECAY * decay)
         words, numbers = split(domain.fixed)
         self._fixed = {name: np.asarray(value, float) for name, value in numbers.items()}
-        names = tuple(name for name in domain.parameters if name != series.parameter)
+        names = tuple(name for name in domain.parameters if name != self._series)
         shapes = tuple((name, value.shape) for name, value in self._fixed.items())
-        self._key = (system.models["floquet"].build, series, names, words, shapes)
+        self._key = (system.models["floquet"].build, self._series, names, words, shapes)
         # While held-out points are solved.
         _kernel(self._key, FIRST_GIVEN)
 
@@ -251,7 +249,7 @@ class SeriesNodes:
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
         columns = dict(zip(self._domain.parameters, self._domain.points(grid).T, strict=True))
         steps = steps_needed(self._system, {**self._domain.fixed, **columns}, _STEPS_AT)
-        return {name: column for name, column in columns.items() if name != self._series.parameter}, steps
+        return {name: column for name, column in columns.items() if name != self._series}, steps
 
     def _along(
         self, compiled: Future[Any], columns: Mapping[str, np.ndarray], end: float, parts: float, x: np.ndarray
@@ -277,7 +275,7 @@ def _kernel(key: Key, positions: int) -> Future[Any]:
     build, series, names, words, fixed = key
 
     def lines(columns: dict, numbers: dict, value: Array, parts: Array, x: Array) -> tuple[Array, Array]:
-        form = build({**dict(words), **numbers, **columns, series.parameter: value}).reduced
+        form = build({**dict(words), **numbers, **columns, series: value}).reduced
         return propagators_along(form, _LANES, parts, x)
 
     def array(*shape: int) -> jax.ShapeDtypeStruct:

@@ -26,7 +26,7 @@ from drivetrain_jax.systems._models import (
     UnderdampedOscillator,
     dense,
 )
-from drivetrain_jax.systems._smoothness import Balance, Coordinate, Enclosure, Series, Smoothness
+from drivetrain_jax.systems._smoothness import Coordinate, Enclosure, Smoothness
 
 _BUILT_IN = {
     "cardan": "Cardan",
@@ -40,7 +40,6 @@ _BUILT_IN = {
 _REGISTERED: dict[str, type[System]] = {}
 
 __all__ = [
-    "Balance",
     "Block",
     "Component",
     "Conversion",
@@ -58,7 +57,6 @@ __all__ = [
     "PhysicalData",
     "PiecewiseLinearOscillator",
     "Resonances",
-    "Series",
     "Shaft",
     "Smoothness",
     "SpringSystem",

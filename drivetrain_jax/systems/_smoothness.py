@@ -31,30 +31,7 @@ def identity(name: str) -> Coordinate:
     return Coordinate(name, np.asarray, np.asarray, lambda x: np.ones_like(np.asarray(x, float)))
 
 
-@dataclass(frozen=True)
-class Series:
-    """``A(t) = x B(t)`` with the coordinate x of ``parameter``, for the reduced form of a ``FloquetModel``.
-
-    The propagator is then a power series in x whose terms are integrals.
-    """
-
-    parameter: str
-
-
 Columns = Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class Balance:
-    """Interpolated is ``T Phi S`` with diagonal T and S that keep the multipliers: its entries are of one size, and bounded.
-
-    ``scales(values, middle)`` are the diagonals of T and S, ``(n, ...)`` each, for columns of parameters; ``middle`` holds
-    one value of each parameter, for the whole domain.
-    """
-
-    scales: Callable[[Columns, Columns], tuple[np.ndarray, np.ndarray]]
-
-
 # Half a unit in the last place of a number between 1 and 2.
 UNIT = 2.0**-53
 
@@ -97,13 +74,19 @@ class Enclosure:
 class Smoothness:
     """Coordinates by parameter in which the results of a model are smooth; a missing parameter is its own coordinate.
 
-    With ``series`` an atlas computes all its nodes along the parameter of the series together. With ``balance`` its
-    polynomials are fewer; with ``enclosure`` its verdicts are proved.
+    ``series`` names a parameter with whose coordinate x the reduced form of the ``FloquetModel`` is ``A(t) = x B(t)``. The
+    propagator is then a power series in x whose terms are integrals, and an atlas computes all its nodes along x together.
+
+    ``balance(values, middle)`` returns the diagonals of T and S, ``(n, ...)`` each, for columns of parameters; ``middle``
+    holds one value of each parameter, for the whole domain. An atlas then interpolates ``T Phi S``, whose multipliers are
+    those of Phi and whose entries are of one size and bounded, with fewer polynomials.
+
+    With ``enclosure`` the verdicts of an atlas are proved.
     """
 
     coordinates: Mapping[str, Coordinate]
-    series: Series | None = None
-    balance: Balance | None = None
+    series: str = ""
+    balance: Callable[[Columns, Columns], tuple[np.ndarray, np.ndarray]] | None = None
     enclosure: Enclosure | None = None
 
     def coordinate(self, parameter: str) -> Coordinate:

@@ -36,9 +36,9 @@ from drivetrain_jax.systems._base import (
     serves,
 )
 from drivetrain_jax.systems._models import SWAP, Components, FloquetModel, Flow, ForcedModel, LinearPeriodic, Rows
-from drivetrain_jax.systems._smoothness import Coordinate, Series, Smoothness
+from drivetrain_jax.systems._smoothness import Coordinate, Smoothness
 from drivetrain_jax.systems._tubes import TUBES, stiffness_of_tubes
-from drivetrain_jax.systems.cardan_bounds import BALANCE, ENCLOSURE
+from drivetrain_jax.systems.cardan_bounds import ENCLOSURE, balance
 
 # Clock of the reduced equations, and predicted numbers of steps in this clock.
 
@@ -205,8 +205,8 @@ SMOOTH = Smoothness(
             "1/sqrt(gamma)", lambda x: 1 / np.sqrt(x), _inverse_square, lambda x: -0.5 / (np.sqrt(x) * np.asarray(x))
         ),
     },
-    Series("Omega"),
-    BALANCE,
+    "Omega",
+    balance,
     ENCLOSURE,
 )
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from drivetrain_jax.systems._smoothness import UNIT, Balance, Columns, Enclosure, frobenius, rounding
+from drivetrain_jax.systems._smoothness import UNIT, Columns, Enclosure, frobenius, rounding
 from drivetrain_jax.systems.cardan_balls import propagator
 
 # Growth and scales of T Phi S, eqs (15)-(16).
@@ -25,7 +25,7 @@ def _typical(middle: Columns) -> tuple[float, float]:
     return middle["mu"] ** 0.5, middle["gamma"] ** -0.5
 
 
-def _scales(values: Columns, middle: Columns) -> tuple[np.ndarray, np.ndarray]:
+def balance(values: Columns, middle: Columns) -> tuple[np.ndarray, np.ndarray]:
     """T, which depends on the angle alone, and S: near them (T Phi S) is orthogonal without damping."""
     root_mu, g = _typical(middle)
     one = np.ones_like(np.asarray(values["beta"], float))
@@ -67,9 +67,6 @@ def _growth(x: Columns, middle: Columns) -> np.ndarray:
     start += first**2 + k**2 + ((root_mu * g) ** 2 + (zeta * alpha * g**2) ** 2) / k**2
     # The path around the poles of eta ends where cos(beta) is negative.
     return np.where(turn < 3.1, rotation + damped + coupled + np.log(end * start) / 2, np.inf)
-
-
-BALANCE = Balance(_scales)
 
 
 # Enclosures of propagators y' = s w B(eta) y with y = (q, p), eq. (10), over the clock u = tan(chi/2) from 0 to 1:

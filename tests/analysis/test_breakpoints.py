@@ -182,5 +182,5 @@ def test_a_lane_with_a_breakpoint_outside_of_the_period_has_no_value():
 
 def test_series_refuse_breakpoints():
     form = LinearPeriodic(lambda t: ((0 * t,),), 3.0, breakpoints=(1.0,))
-    with pytest.raises(dt.InputError, match=r"^breakpoints: got 1; expected none with a Series$"):
+    with pytest.raises(dt.InputError, match=r"^breakpoints: got 1; expected none with a series$"):
         propagators_along(form, 1, jnp.int32(4), jnp.zeros(1))

@@ -332,7 +332,7 @@ def propagators_along(system: LinearPeriodic, lanes: int, parts: Array, x: Array
     the size of the last term relative to the largest term, in the worst part.
     """
     if system.breakpoints:
-        raise InputError(f"breakpoints: got {len(system.breakpoints)}; expected none with a Series")
+        raise InputError(f"breakpoints: got {len(system.breakpoints)}; expected none with a series")
     weights, _, places = radau(NODES)
     size, length = system.size, system.span / parts
     powers = x[:, None] ** jnp.arange(TERMS + 1)
