@@ -35,14 +35,6 @@ from drivetrain_jax.analysis.numerics.singular_values import (
 from drivetrain_jax.resonances import operating_range
 from drivetrain_jax.systems import Block, Model, SpringSystem, System
 
-# Modes of one block of a spring system, with the family of each mode or its shares of several families.
-#
-# Eigenvectors of a multiple frequency are arbitrary within their space. A rotation makes them diagonalise the operator whose
-# eigenvalue is the number of the family, so that a pure mode in the space becomes an eigenvector. Eigenvectors of
-# different frequencies stay unchanged, however close the frequencies are. Only the type of a mode may come from a vector
-# rotated within a wider cluster.
-
-
 # Branches of modes along a path, by the modal assurance criterion (MAC) between neighbouring points.
 #
 # Modes that exchange their order in frequency keep their branches. At a veering, where two modes exchange their shapes,
@@ -116,6 +108,14 @@ def _carry(overlap: Array, shapes: Array, equal: Array, chosen: Array) -> Array:
     return looped_matmul(shapes, jnp.swapaxes(weights, 0, 1))
 
 
+# Modes of one block of a spring system, with the family of each mode or its shares of several families.
+#
+# Eigenvectors of a multiple frequency are arbitrary within their space. A rotation makes them diagonalise the operator whose
+# eigenvalue is the number of the family, so that a pure mode in the space becomes an eigenvector. Eigenvectors of
+# different frequencies stay unchanged, however close the frequencies are. Only the type of a mode may come from a vector
+# rotated within a wider cluster.
+
+
 # Code of a rigid mode; then follow the codes of the families and of a coupled mode.
 RIGID = 0
 # Largest share of a mode outside a family for which the mode belongs to the family.
@@ -133,13 +133,12 @@ _CLUSTER_IF_SYMMETRIC = 5e-5
 _POLARISATION = 0.5
 
 
-class BlockModes(NamedTuple):
-    """Modes of one block: angular ``frequency`` (n, ...), mass-weighted ``vectors`` (n, n, ...) as columns in the
-    coordinates of the block, share of each family ``participation`` (n, families, ...), code of the
-    type as ``label`` (n, ...), ``found`` (...)."""
+class Modes(NamedTuple):
+    """Modes by rising angular ``frequency`` (n, N): mass-weighted ``vectors`` (coordinates, n, N) as columns or None, share
+    of each family ``participation`` (n, families, N), code of the family as ``label`` (n, N), ``found`` (N,)."""
 
     frequency: Array
-    vectors: Array
+    vectors: Array | None
     participation: Array
     label: Array
     found: Array
@@ -150,15 +149,16 @@ def mode_type_names(families: tuple[str, ...]) -> tuple[str, ...]:
     return ("rigid", *families, "coupled")
 
 
-def block_modes(block: Block, largest: Array, asymmetry: Array, families: int) -> BlockModes:
-    """Modes of ``block`` (lanes (N,)) by rising frequency; ``largest`` is the system's largest angular frequency.
+def block_modes(block: Block, largest: Array, asymmetry: Array, families: int) -> Modes:
+    """Modes of ``block``, in its coordinates; ``largest`` is the system's largest angular frequency.
 
     The frequencies are singular values and not norms ``|G v|`` of the factor times a vector: errors of rotated vectors, and
     for rigid modes the rounding of all rotations, would enter the norms.
     """
     frequency, values_found = singular_values(block.factor)
     vectors, vectors_found = jacobi_vectors(block.factor)
-    vectors = _rising(block.factor, vectors)
+    order = jnp.argsort(jnp.sum(looped_matmul(block.factor, vectors) ** 2, axis=0), axis=0)
+    vectors = jnp.take_along_axis(vectors, order[None], axis=1)
     rounding = jnp.broadcast_to(_ROUNDINGS * EPS * largest, frequency[1:].shape)
     separated = _turned(block, vectors, clusters(frequency, rounding), np.where(block.polar, _POLARISATION, 0.0))
     relative = jnp.where(asymmetry <= SYMMETRIC, _CLUSTER_IF_SYMMETRIC, CLUSTER)
@@ -166,12 +166,7 @@ def block_modes(block: Block, largest: Array, asymmetry: Array, families: int) -
     if len(set(block.family)) > 1:
         named = _turned(block, vectors, clusters(frequency, jnp.maximum(relative * frequency[1:], rounding)), 0.0)
     share, label = _participation(block, separated, families), _label(_participation(block, named, families))
-    return BlockModes(frequency, separated, share, label, values_found & vectors_found)
-
-
-def _rising(factor: Array, vectors: Array) -> Array:
-    order = jnp.argsort(jnp.sum(looped_matmul(factor, vectors) ** 2, axis=0), axis=0)
-    return jnp.take_along_axis(vectors, order[None], axis=1)
+    return Modes(frequency, separated, share, label, values_found & vectors_found)
 
 
 def _in_frame(block: Block, vectors: Array) -> Array:
@@ -220,11 +215,6 @@ def _label(participation: Array) -> Array:
     return jnp.where(jnp.any(pure, axis=1), 1 + jnp.argmax(pure, axis=1), 1 + participation.shape[1])
 
 
-def mode_types(frequency: Array, label: Array, largest: Array) -> Array:
-    """Codes of the types, int8 (n, ...), from the codes of the families and the rigid modes."""
-    return jnp.where(is_rigid(frequency, largest), RIGID, label).astype(jnp.int8)
-
-
 def is_rigid(frequency: Array, largest: Array) -> Array:
     """Flags of modes whose frequency is zero up to rounding of the largest frequency."""
     return frequency <= _ROUNDINGS * EPS * largest
@@ -251,17 +241,6 @@ _FOLLOWED = {"branch", "mac"}
 # Chunks of the engine, and lanes computed at a time, which fit into the cache of a core.
 _SPECTRUM_CHUNK, _MODES_CHUNK, _LINES_CHUNK = 512, 256, 8
 _CACHE = 1 << 16
-
-
-class Modes(NamedTuple):
-    """Modes of the whole system by rising frequency: angular ``frequency`` (n, N), mass-weighted ``vectors`` (dofs, n, N) or
-    None, ``participation`` (n, families, N), ``label`` of the family (n, N), ``found`` (N,)."""
-
-    frequency: Array
-    vectors: Array | None
-    participation: Array
-    label: Array
-    found: Array
 
 
 def _lanes_at_a_time(blocks: tuple[Block, ...]) -> int:
@@ -324,7 +303,7 @@ def system_modes(model: SpringSystem, method: str, lanes: int, shapes: bool = Tr
     order = jnp.argsort(frequency, axis=0)
     vectors = None
     if shapes:
-        lifted = jnp.concatenate([_lift(b, p, lanes) for b, p in zip(blocks, parts, strict=True)], axis=1)
+        lifted = jnp.concatenate([_lift(b, p.vectors, lanes) for b, p in zip(blocks, parts, strict=True)], axis=1)  # pyright: ignore[reportArgumentType]
         vectors = jnp.take_along_axis(lifted, order[None], axis=1)
     return Modes(
         jnp.take_along_axis(frequency, order, axis=0),
@@ -340,23 +319,20 @@ def _as_lanes(block: Block, lanes: int) -> Block:
     return Block(_in_lanes(block.factor, lanes), block.family, block.polar, block.basis, frame)
 
 
-def _lift(block: Block, part: BlockModes, lanes: int) -> Array:
-    """Vectors of a block in the coordinates of the system, (dofs, n * copies, N)."""
+def _lift(block: Block, vectors: Array, lanes: int) -> Array:
+    """``vectors`` of a block in the coordinates of the system, (dofs, n * copies, N)."""
     basis = block.basis if block.basis.ndim == 4 else block.basis[..., None]
-    lifted = sum(basis[:, c, None] * part.vectors[c, :, None] for c in range(basis.shape[1]))
+    lifted = sum(basis[:, c, None] * vectors[c, :, None] for c in range(basis.shape[1]))
     lifted = lifted.reshape(basis.shape[0], -1, lifted.shape[-1])  # pyright: ignore[reportAttributeAccessIssue]
     return jnp.broadcast_to(lifted, (*lifted.shape[:2], lanes))
 
 
 def _canonical(vectors: Array) -> Array:
     """``vectors`` with signs that make the largest entry of every column positive."""
-    largest = jnp.take_along_axis(vectors, jnp.argmax(jnp.abs(vectors) - 1e-9 * _places(vectors), 0)[None], axis=0)
+    # The first of entries that are equal up to rounding.
+    places = 1e-9 * np.arange(len(vectors)).reshape(-1, 1, 1)
+    largest = jnp.take_along_axis(vectors, jnp.argmax(jnp.abs(vectors) - places, 0)[None], axis=0)
     return vectors * jnp.where(largest < 0, -1.0, 1.0)
-
-
-def _places(vectors: Array) -> np.ndarray:
-    """Row numbers, to select the first of entries that are equal up to rounding."""
-    return np.arange(vectors.shape[0]).reshape(-1, 1, 1)
 
 
 def _results(build: Build, request: Request, values: Mapping[str, Any], lanes: int) -> dict[str, Array]:
@@ -376,14 +352,14 @@ def _results(build: Build, request: Request, values: Mapping[str, Any], lanes: i
         dominant = jnp.where(modes.found, jnp.argmax(modes.participation, axis=1), model.families)
         results["dominant_family"] = dominant.astype(jnp.int8)
         results["dominant_share"] = jnp.sort(results["participation"], axis=1)[:, -1]
-        results["mode_type"] = jnp.where(
-            modes.found, mode_types(modes.frequency, modes.label, largest), model.families + 1
-        )
+        kind = jnp.where(is_rigid(modes.frequency, largest), RIGID, modes.label)
+        results["mode_type"] = jnp.where(modes.found, kind, model.families + 1).astype(jnp.int8)
         if shapes:
             vectors = jnp.where(modes.found, _canonical(modes.vectors), jnp.nan)  # pyright: ignore[reportArgumentType]
             mass = model.mass[:, None] if model.mass.ndim == 2 else model.mass[:, None, None]
             results["mode_shape"] = jnp.swapaxes(vectors / jnp.sqrt(mass), 0, 1)
-            results["kinetic_energy"] = _by_body(vectors, model.bodies)
+            squares = [vectors[model.bodies == body] ** 2 for body in range(model.bodies.max() + 1)]
+            results["kinetic_energy"] = jnp.stack([jnp.sum(part, axis=0) for part in squares], axis=1)
             results["vectors"] = vectors
         equal = one_frequency(modes.frequency, largest)
         results["multiplicity"] = jnp.where(modes.found, jnp.sum(equal, axis=1), 0).astype(jnp.int32)
@@ -393,11 +369,6 @@ def _results(build: Build, request: Request, values: Mapping[str, Any], lanes: i
 
     sample = _blocks(build(_first_lane(values)), request.method)
     return in_blocks(compute, values, lanes, max(_lanes_at_a_time(sample) // 2, 16))
-
-
-def _by_body(vectors: Array, bodies: np.ndarray) -> Array:
-    """Shares of kinetic energy (n, bodies, N) of mass-weighted ``vectors`` (dofs, n, N)."""
-    return jnp.stack([jnp.sum(vectors[bodies == body] ** 2, axis=0) for body in range(bodies.max() + 1)], axis=1)
 
 
 def _frequencies(frequency: Array, complete: Array, participation: Array | None) -> dict[str, Array]:
