@@ -185,25 +185,19 @@ _FEWEST = 6
 _NUMBERS, _CHUNK = 1 << 23, 64
 
 
-class Section(NamedTuple):
-    """States at the strobes, shape ``(strobes, n, ...)``, states at the first discarded strobes, and the outcome."""
-
-    states: Array
-    early: Array
-    outcome: Array
-
-
-def fixed_section(flow: Flow, request: Request) -> Section:
-    """The section by equal steps."""
+def fixed_section(flow: Flow, request: Request) -> tuple[Array, Array, Array]:
+    """States at the strobes by equal steps, shape ``(strobes, n, ...)``, states at the first discarded strobes, and the
+    outcome."""
     steps, first = request.options["steps"], request.options["discard"]
     early, _ = sampled(flow, steps, initial_state(flow), jnp.int64(0), min(EARLY, first))
     state = discarded(flow, steps, jnp.int64(first))
     states, _ = sampled(flow, steps, state, jnp.int64(first), request.options["strobes"])
-    return Section(states, early, jnp.full(states.shape[2:], Outcome.SUCCESS, jnp.int8))
+    return states, early, jnp.full(states.shape[2:], Outcome.SUCCESS, jnp.int8)
 
 
-def adaptive_section(flow: Flow, request: Request) -> Section:
-    """The section of one point by the adaptive pair; every strobe is the end of a step. States after a failure are NaN."""
+def adaptive_section(flow: Flow, request: Request) -> tuple[Array, Array, Array]:
+    """As :func:`fixed_section`, of one point by the adaptive pair; every strobe is the end of a step. States after a failure
+    are NaN."""
     rtol, atol, first = (request.options[name] for name in ("rtol", "atol", "discard"))
     controller = diffrax.PIDController(rtol=rtol, atol=atol)
 
@@ -230,7 +224,7 @@ def adaptive_section(flow: Flow, request: Request) -> Section:
     carry = jax.lax.fori_loop(len(early), first, lambda k, c: advance(c, k), carry)
     (_, well, _), states = jax.lax.scan(keep, carry, first + jnp.arange(request.options["strobes"]))
     failed = jnp.where(begins, Outcome.STEP_LIMIT, Outcome.NOT_FINITE)
-    return Section(states, early, jnp.where(well, Outcome.SUCCESS, failed).astype(jnp.int8))
+    return states, early, jnp.where(well, Outcome.SUCCESS, failed).astype(jnp.int8)
 
 
 def checking_steps(request: Request) -> Steps:

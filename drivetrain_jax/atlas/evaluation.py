@@ -44,15 +44,6 @@ class Tile:
     spread: np.ndarray | None
 
 
-@dataclass(frozen=True)
-class _Band:
-    """The cells of a tile along the last axis, with its ``columns`` and ``spread``."""
-
-    chosen: np.ndarray
-    columns: np.ndarray
-    spread: np.ndarray | None
-
-
 def tiles(
     atlas: Atlas, axes: Sequence[np.ndarray], most: tuple[int, int], *, rows: int | None = None, dense: bool = True
 ) -> Iterator[Tile]:
@@ -74,7 +65,7 @@ def tiles(
             continue
         bands = _bands(panel, axes[-1], groups[-1], degrees[1], shape[1], dense)
         # One band of each kind first, so that their kernels are compiled in parallel.
-        first_of_kind = {band.spread is None: k for k, band in reversed(list(enumerate(bands)))}.values()
+        first_of_kind = {spread is None: k for k, (*_, spread) in reversed(list(enumerate(bands)))}.values()
         bands = [bands[k] for k in sorted(range(len(bands)), key=lambda k: k not in first_of_kind)]
         for fixed, coefficients in _reductions(panel, axes, groups[:-2]):
             fill = [(0, n - k) for n, k in zip(degrees, coefficients.shape, strict=False)]
@@ -83,8 +74,8 @@ def tiles(
                 chosen = groups[-2][start : start + shape[0]]
                 weights = filled_up(chebyshev(_positions(panel, -2, axes[-2][chosen]), degrees[0]), shape[0])
                 first = _first_product(weights, tensor)
-                for band in bands:
-                    yield Tile(panel, (*fixed, chosen, band.chosen), first, band.columns, band.spread)
+                for cells, columns, spread in bands:
+                    yield Tile(panel, (*fixed, chosen, cells), first, columns, spread)
 
 
 @jax.jit
@@ -122,8 +113,11 @@ def _shared(count: int, most: int, step: int, multiple: int = 1) -> int:
     return -(-count // (pieces * step)) * step
 
 
-def _bands(panel: Panel, axis: np.ndarray, cells: np.ndarray, degree: int, width: int, dense: bool) -> list[_Band]:
-    """The cells of a panel along the last axis, cut into bands of at most ``width`` neighbours."""
+def _bands(
+    panel: Panel, axis: np.ndarray, cells: np.ndarray, degree: int, width: int, dense: bool
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray | None]]:
+    """The cells of a panel along the last axis in bands of at most ``width`` neighbours, each with the ``columns`` and the
+    ``spread`` of its tiles."""
     t, bands, x, start = _positions(panel, -1, axis[cells]), [], nodes(NODES), 0
     angle = -np.arccos(t)
     # Cells that a band with nodes may span from each cell on, limited by the degree of the panel.
@@ -140,7 +134,7 @@ def _bands(panel: Panel, axis: np.ndarray, cells: np.ndarray, degree: int, width
             columns = chebyshev(np.clip((at[0] * (1 - x) + at[-1] * (1 + x)) / 2, -1.0, 1.0), degree)
         else:
             columns = filled_up(chebyshev(at, degree), width)
-        bands.append(_Band(cells[part], np.ascontiguousarray(columns.T), spread))
+        bands.append((cells[part], np.ascontiguousarray(columns.T), spread))
         start = part.stop
     return bands
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebder
@@ -18,7 +17,7 @@ from numpy.polynomial.chebyshev import chebder
 from drivetrain_jax._machine import in_threads
 from drivetrain_jax.atlas.criteria import Criteria
 from drivetrain_jax.atlas.interpolation import analysis_matrix, nodes, on_grid, restriction, slabs
-from drivetrain_jax.atlas.panels import Panel, chebyshev, grid_positions, position_between
+from drivetrain_jax.atlas.panels import Panel, chebyshev, position_between
 
 # Nodes of a patch in each coordinate, tail of the series relative to its size, the multiple of it up to which a tail may be
 # rounding, and the largest number of patches.
@@ -204,11 +203,11 @@ def _cover(criteria: Criteria, panel: Panel) -> tuple[Patches, ...]:
     counts = [max(1, round(_FIRST * np.max(np.flatnonzero(s > _TAIL * s.max()), initial=0))) for s in sizes]
     before = [np.inf] * len(counts)
     while True:
-        sample = _sample(criteria, panel, counts)
-        tails = [_tail(sample.coefficients, axis) for axis in range(len(counts))]
-        size = np.abs(sample.coefficients).sum(axis=tuple(range(1, len(counts) + 1)))
+        coefficients, levers, floor, lower, upper = _sample(criteria, panel, counts)
+        tails = [_tail(coefficients, axis) for axis in range(len(counts))]
+        size = np.abs(coefficients).sum(axis=tuple(range(1, len(counts) + 1)))
         with np.errstate(all="ignore"):
-            excess = [np.nanmax(tail / np.maximum(_TAIL * size, sample.floor / 8)) for tail in tails]
+            excess = [np.nanmax(tail / np.maximum(_TAIL * size, floor / 8)) for tail in tails]
         # A small tail that does not fall with smaller patches is rounding.
         rough = [e > 1 and (e < b / 2 or _ROUNDING < e < np.inf) for e, b in zip(excess, before, strict=True)]
         if not any(rough) or np.prod(counts) * 2 > _MAX_PATCHES:
@@ -216,12 +215,12 @@ def _cover(criteria: Criteria, panel: Panel) -> tuple[Patches, ...]:
         before = [e if split else b for e, b, split in zip(excess, before, rough, strict=True)]
         counts = [int(np.ceil(1.5 * count)) if split else count for count, split in zip(counts, rough, strict=True)]
     # The truncated tail is about as large as the last kept coefficients.
-    floors = sample.floor + 4 * sum(tails)
+    floors = floor + 4 * sum(tails)
     floors = np.where(np.isfinite(floors), floors, np.inf)
-    roughness = _roughness(panel, sample.lower, sample.upper)
+    roughness = _roughness(panel, lower, upper)
     return tuple(
-        Patches(sample.lower, sample.upper, np.nan_to_num(c), np.nan_to_num(lever), floor, roughness)
-        for c, lever, floor in zip(sample.coefficients, sample.lever, floors, strict=True)
+        Patches(lower, upper, np.nan_to_num(c), np.nan_to_num(lever), floor, roughness)
+        for c, lever, floor in zip(coefficients, levers, floors, strict=True)
     )
 
 
@@ -233,23 +232,18 @@ def _roughness(panel: Panel, lower: np.ndarray, upper: np.ndarray) -> np.ndarray
     return degree / half * np.minimum(degree, 1 / np.sqrt(np.maximum(1 - reach**2, degree**-2)))
 
 
-class _Sample(NamedTuple):
-    """Series ``(k, n, ..., n, N)`` of the functions and of their errors' levers, floors ``(k, N)``, boxes ``(N, d)``."""
+def _sample(criteria: Criteria, panel: Panel, counts: list[int]) -> tuple[np.ndarray, ...]:
+    """The functions on counts[0] x counts[1] equal patches of one panel.
 
-    coefficients: np.ndarray
-    lever: np.ndarray
-    floor: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-
-
-def _sample(criteria: Criteria, panel: Panel, counts: list[int]) -> _Sample:
-    """The functions on counts[0] x counts[1] equal patches of one panel."""
+    Returns: series ``(k, n, ..., n, N)`` of the functions and of their errors' levers, floors ``(k, N)``, and the lower and
+    upper ends ``(N, d)`` of the boxes.
+    """
     d = len(counts)
     edges = [np.linspace(panel.lower[k], panel.upper[k], counts[k] + 1) for k in range(d)]
     t = nodes(NODES)
     axes = tuple((e[:-1, None] * (1 - t) / 2 + e[1:, None] * (1 + t) / 2).reshape(-1) for e in edges)
-    phi = on_grid(panel.coefficients, grid_positions(panel, axes))
+    positions = [position_between(*ends) for ends in zip(panel.lower, panel.upper, axes, strict=True)]
+    phi = on_grid(panel.coefficients, positions)
     log_determinant = criteria.log_determinant(_mesh(axes)).reshape(phi.shape[1:])
     split = tuple(n for count in counts for n in (count, NODES))
     order = (0, *range(2, 2 * d + 1, 2), *range(1, 2 * d + 1, 2))
@@ -269,7 +263,7 @@ def _sample(criteria: Criteria, panel: Panel, counts: list[int]) -> _Sample:
     parts = [slice(start, start + rows) for start in range(0, phi.shape[1], rows)]
     bounds = in_threads(parts, lambda part: criteria.errors(panel, phi[:, part], log_determinant[part]))
     floor, lever = (np.concatenate(x, axis=1) for x in zip(*(pair for _, pair in bounds), strict=True))
-    return _Sample(
+    return (
         series(criteria.derive(phi, log_determinant)),
         series(lever),
         by_patch(floor).max(axis=tuple(range(1, d + 1))),

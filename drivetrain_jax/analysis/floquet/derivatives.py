@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial, reduce
 from math import isqrt
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -131,32 +131,14 @@ _GAIN = 2.0 ** (ORDER - 3)
 _SIMPLE = 1e-7
 
 
-class DifferentiableMonodromy(NamedTuple):
-    """The monodromy matrix ``exp(log_scale) z``, ``(n, n)``, and the relative error of z.
+def monodromy(
+    build: Build, parameters: Any, constants: Constants, panels: Array
+) -> tuple[Array, Array, Array, Callable[[Array], Array]]:
+    """The monodromy matrix ``exp(log_scale) z`` of one point in ``panels`` panels: ``z``, ``log_scale``, error, gradient.
 
-    ``pull(weights)`` is the gradient ``(F, P)`` of ``sum(weights * z)`` for ``weights`` ``(F, n, n)`` at a fixed log_scale.
+    The error is the relative one of z. The last result maps ``weights`` ``(F, n, n)`` to the gradient ``(F, P)`` of
+    ``sum(weights * z)`` at a fixed log_scale by ``parameters``, a pytree of P numbers.
     """
-
-    z: Array
-    log_scale: Array
-    error: Array
-    pull: Callable[[Array], Array]
-
-
-class Multipliers(NamedTuple):
-    """Multipliers ``sigma`` by falling modulus, ``(n,)``, and their derivatives by the entries of the matrix, ``(n, n, n)``.
-
-    A derivative is NaN where its multiplier is not simple, or below its error. ``error`` is the relative error of the first
-    multiplier, which grows where multipliers coalesce.
-    """
-
-    sigma: Array
-    by_entry: Array
-    error: Array
-
-
-def monodromy(build: Build, parameters: Any, constants: Constants, panels: Array) -> DifferentiableMonodromy:
-    """The monodromy matrix of one point in ``panels`` panels, differentiable by ``parameters``, a pytree of P numbers."""
     # Half as many panels show the error, because nothing else checks their predicted number.
     counts = jnp.stack([(panels + 1) // 2, panels])
     coarse, parts = jax.lax.map(partial(propagators, build, parameters, constants), counts)
@@ -184,11 +166,15 @@ def monodromy(build: Build, parameters: Any, constants: Constants, panels: Array
         return jnp.stack(jax.tree.leaves(gradient), axis=1)
 
     error = jnp.maximum(_MATRIX_ERROR, halves * change / _GAIN)
-    return DifferentiableMonodromy(value, halves * jnp.log(size), error, pull)
+    return value, halves * jnp.log(size), error, pull
 
 
-def multipliers(z: Array, matrix_error: Array) -> Multipliers:
-    """The multipliers of ``z``, ``(n, n)``, whose relative error is ``matrix_error``."""
+def multipliers(z: Array, matrix_error: Array) -> tuple[Array, Array, Array]:
+    """The multipliers of ``z``, ``(n, n)``, whose relative error is ``matrix_error``, by falling modulus, ``(n,)``; their
+    derivatives by the entries of z, ``(n, n, n)``; and the relative error of the first one.
+
+    A derivative is NaN where its multiplier is not simple, or below its error, which grows where multipliers coalesce.
+    """
     n = len(z)
     sigma = sort_multipliers(*(x[..., None] for x in eigenvalues(z)))[:, 0]
     rho = jnp.abs(sigma[0])
@@ -203,7 +189,7 @@ def multipliers(z: Array, matrix_error: Array) -> Multipliers:
     error = matrix_error * jnp.linalg.norm(adjugate, axis=(1, 2)) * jnp.linalg.norm(z) / jnp.abs(slope)
     known = simple & (error < jnp.abs(sigma))
     by_entry = jnp.swapaxes(adjugate, 1, 2) / jnp.where(known, slope, jnp.nan)[:, None, None]
-    return Multipliers(sigma, by_entry, error[0] / rho)
+    return sigma, by_entry, error[0] / rho
 
 
 def shares_modulus(sigma: Array, error: Array | float) -> Array:

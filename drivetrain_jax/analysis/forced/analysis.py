@@ -110,10 +110,11 @@ def amplitudes(
         )
         return _Peaks(t0, t1, y, aimed, largest, when, s.count + 1, jump, state, controlled)
 
-    zero = jnp.zeros(())
+    zero, largest = jnp.zeros(()), jnp.abs(rows @ start)
     t1, controlled = control.init(term, zero, period, fixed(start), None, None, solver.func, order)
     t1 = jnp.minimum(t1, period)
-    first = _at_start(t1, start, rows, solver.init(term, zero, t1, start, None), controlled)
+    begun = jnp.zeros((), int), jnp.array(False), solver.init(term, zero, t1, start, None), controlled
+    first = _Peaks(zero, t1, start, largest < 0, largest, 0 * largest, *begun)
     last = jax.lax.while_loop(unfinished, advance, first)
     stopped = jnp.where(last.count < MAX_STEPS, Outcome.NOT_FINITE, Outcome.STEP_LIMIT)
     return last.largest, last.when, last.y, jnp.where(last.t0 < period, stopped, Outcome.SUCCESS)
@@ -122,13 +123,6 @@ def amplitudes(
 def _larger(best: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
     """The larger values of both pairs of values and times."""
     return jnp.maximum(best[0], other[0]), jnp.where(other[0] > best[0], other[1], best[1])
-
-
-def _at_start(t1: Array, start: Array, rows: Array, solver: Any, control: Any) -> _Peaks:
-    """The loop before its first step, to ``t1``."""
-    largest, zero = jnp.abs(rows @ start), jnp.zeros(())
-    jump, count = jnp.array(False), jnp.zeros((), int)
-    return _Peaks(zero, t1, start, largest < 0, largest, 0 * largest, count, jump, solver, control)
 
 
 def _larger_peaks(s: _Peaks, peaks: _Found, keep: Any) -> tuple[tuple[Array, Array], Array, Array]:
@@ -294,7 +288,7 @@ def _closed(
     if rows is not None:
         largest, phase, end, closed = amplitudes(field, start, model.period, rows, sharp)
     else:
-        (largest, phase), (end, closed) = (None, None), integrate(field, start, model.period, sharp)
+        (largest, phase), (end, closed, _) = (None, None), integrate(field, start, model.period, sharp)
     return (largest, phase), newton_step(Transition(end, matrix, closed), start), closed
 
 
@@ -535,9 +529,8 @@ def _slopes(
         return jnp.concatenate([jnp.zeros((0, end)), *(every[part] for part in parts.values())])
 
     places = jnp.concatenate([jnp.zeros(0), *(results[f"{name}_phase"] for name in parts)]) / here.period
-    slopes = periodic_slopes(field, parameters, results[state], (places, rows), _sharpness(rtol, 1.0))
-    ends = dict(zip(parts, jnp.split(slopes.tops, max(len(parts), 1)), strict=False))
-    return {state: slopes.state} | ends
+    of_state, of_tops = periodic_slopes(field, parameters, results[state], (places, rows), _sharpness(rtol, 1.0))
+    return {state: of_state} | dict(zip(parts, jnp.split(of_tops, max(len(parts), 1)), strict=False))
 
 
 def _displacements(system: type[System]) -> Dimension:

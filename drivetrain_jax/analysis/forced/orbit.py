@@ -89,15 +89,11 @@ def controller(period: float, rtol: Array | float) -> diffrax.PIDController:
     return diffrax.PIDController(rtol=rtol, atol=ATOL_RATIO * rtol, dtmin=STEP_RATIO * period, force_dtmin=False)
 
 
-def integrate(field: Field, start: Array, period: Array | float, rtol: Array | float) -> tuple[Array, Array]:
-    """State after one period from ``start`` at t = 0, by Dopri8 with error control, and an ``Outcome``."""
-    return _integrated(field, start, period, rtol)[:2]
-
-
-def _integrated(
+def integrate(
     field: Field, start: Array, period: Array | float, rtol: Array | float, most: int = MAX_STEPS
 ) -> tuple[Array, Array, Array]:
-    """The results of :func:`integrate` with ``most`` steps, and the number of steps."""
+    """State after one period from ``start`` at t = 0, by Dopri8 with error control, an ``Outcome``, and the number of steps,
+    at most ``most``."""
     import diffrax
 
     solution = diffrax.diffeqsolve(
@@ -124,7 +120,7 @@ def transition(
 ) -> Transition:
     """Map over one period at ``start`` (entries of order one) and its derivative, by the variational equations."""
     columns = jnp.concatenate([start[:, None], jnp.eye(start.size)], axis=1)
-    end, outcome, steps = _integrated(variational(field), columns, period, rtol, most)
+    end, outcome, steps = integrate(variational(field), columns, period, rtol, most)
     return Transition(end[:, 0], end[:, 1:], outcome, steps)
 
 
@@ -159,18 +155,11 @@ def _settled(relative: Array, shrunk: Array, rtol: float) -> Array:
     return (relative <= rtol) | ((relative <= STALLED) & ~(shrunk <= 0.1))
 
 
-class PeriodicSlopes(NamedTuple):
-    """Derivatives by the P parameters: of the ``state`` at the start, ``(n, P)``, and of the largest values ``tops``,
-    ``(k, P)``."""
-
-    state: Array
-    tops: Array
-
-
 def periodic_slopes(
     field: Parametric, parameters: Any, state: Array, peaks: tuple[Array, Callable[[Any], Array]], rtol: float
-) -> PeriodicSlopes:
-    """Derivatives of the periodic solution through ``state`` by all ``parameters``, a pytree of P numbers.
+) -> tuple[Array, Array]:
+    """Derivatives of the periodic solution through ``state``, ``(n, P)``, and of its largest values, ``(k, P)``, by all
+    ``parameters``, a pytree of P numbers.
 
     ``field(parameters, s, y)`` returns ``T f`` at the fraction s of the period. ``peaks`` holds the fractions of the period
     at which the products of rows with y have their largest modulus, and the function of the parameters that returns these
@@ -203,7 +192,7 @@ def periodic_slopes(
         jnp.sign(row @ y[0]) * (row @ (y[1 : n + 1].T @ moved + y[n + 1 :].T) + y[0] @ slope)
         for y, row, slope in zip(on_peaks, rows_at(parameters), by_parameter, strict=True)
     ]
-    return PeriodicSlopes(size * moved / scale, size * jnp.array(tops).reshape(-1, scale.size) / scale)
+    return size * moved / scale, size * jnp.array(tops).reshape(-1, scale.size) / scale
 
 
 def _lifted(field: Parametric, parameters: Any, state: Array, size: Array) -> tuple[Callable[..., Array], Array, Array]:

@@ -209,19 +209,6 @@ _MARGIN = 1e-9
 _VANISHING = 1e-8
 
 
-class Described(NamedTuple):
-    """Results of one motion, each of the shape of its lanes."""
-
-    u_max: Array
-    u_min: Array
-    u_rms: Array
-    phase: Array
-    regime: Array
-    stability: Array
-    spectral_radius: Array
-    residual: Array
-
-
 def extreme(basis: Basis, x: Array, samples: Array, sign: float) -> Array:
     """Largest (``sign = 1``) or smallest (-1) value of a motion: Newton iterations for u' = 0 from the best sample."""
     orders = jnp.asarray(basis.orders).reshape(-1, *(1,) * (x.ndim - 1))
@@ -256,8 +243,8 @@ def repetitions(basis: Basis, x: Array) -> Array:
 
 def describe(
     model: PiecewiseLinearOscillator, basis: Basis, x: Array, omega: Array, exists: Array, saddle: Array
-) -> Described:
-    """Results of the motion with coefficients ``x`` (n, ...); NaN where it does not exist.
+) -> dict[str, Array]:
+    """Results of the motion with coefficients ``x`` (n, ...), each of the shape of its lanes; NaN where it does not exist.
 
     A ``saddle`` of the balance counts as unstable, even if disturbances of the motion do not grow.
     """
@@ -274,9 +261,13 @@ def describe(
     rms = jnp.sqrt(x[0] ** 2 + jnp.sum(x[1:] ** 2, axis=0) / 2)
     stability = jnp.where((radius > 1 + _MARGIN) | saddle, UNSTABLE, STABLE)
     phase = phase_lag(cosine, sine, jnp.maximum(jnp.abs(high), jnp.abs(low)))
-    rms, phase, radius, unbalanced = (jnp.where(exists, v, jnp.nan) for v in (rms, phase, radius, unbalanced))
-    stability = jnp.where(exists, stability, ABSENT).astype(jnp.int8)
-    return Described(high, low, rms, phase, regime(model, high, low), stability, radius, unbalanced)
+    others = {"u_rms": rms, "phase": phase, "spectral_radius": radius, "residual": unbalanced}
+    return {name: jnp.where(exists, value, jnp.nan) for name, value in others.items()} | {
+        "u_max": high,
+        "u_min": low,
+        "regime": regime(model, high, low),
+        "stability": jnp.where(exists, stability, ABSENT).astype(jnp.int8),
+    }
 
 
 def response(
@@ -296,13 +287,12 @@ def response(
     model = replace(model, **fields, omega=None)
     swept_x, balanced, saddle = _sweeps(model, basis, omega, lanes)
 
-    def directions(at: tuple[Array, Array, Array, Array]) -> Described:
+    def directions(at: tuple[Array, Array, Array, Array]) -> dict[str, Array]:
         wide = jnp.broadcast_to(at[0], lanes)
         return jax.vmap(lambda x, *state: describe(model, basis, x, wide, *state))(*at[1:])
 
-    described = jax.lax.map(directions, (jnp.asarray(omega), swept_x, balanced, saddle))
+    results = jax.lax.map(directions, (jnp.asarray(omega), swept_x, balanced, saddle))
     outcome = jnp.where(jnp.all(balanced, axis=1), Outcome.SUCCESS, Outcome.NOT_CONVERGED)
-    results = described._asdict()
     if any(name.startswith("branch_") for name in outputs):
         # The branch starts at the highest frequency, where motions are simplest.
         first = swept_x[int(np.argmax(omega)), 1]
@@ -351,10 +341,9 @@ def _branches(
         x, exists, saddle, every = at_frequency(model, basis, along, frequency, BRANCHES)
         wide = jnp.broadcast_to(frequency, lanes)
         motions = jax.lax.map(lambda one: describe(model, basis, one[0], wide, *one[1:]), (x, exists, saddle))
-        order = jnp.argsort(motions.u_max, axis=0)
-        high, low, stability = (
-            jnp.take_along_axis(v, order, axis=0) for v in (motions.u_max, motions.u_min, motions.stability)
-        )
+        order = jnp.argsort(motions["u_max"], axis=0)
+        kept = ("u_max", "u_min", "stability")
+        high, low, stability = (jnp.take_along_axis(motions[name], order, axis=0) for name in kept)
         return high, low, stability, every & distinct(high, low)
 
     high, low, stability, every = jax.lax.map(motions_at, jnp.asarray(omega))

@@ -314,18 +314,13 @@ def sum_rule_residual(record: Record, spectrum: Spectrum) -> Array:
     return jnp.sum(spectrum.values, axis=0) - jnp.where(record.bounded, mean, _until_the_end(record, series))[0]
 
 
-class Run(NamedTuple):
-    """Records with the step and with twice the step; the second is empty where it is not needed."""
-
-    fine: Record
-    coarse: Record
-
-
-def run_twice(flow: Flow, steps: Any, max_time: float, target: float, members: Array, to_the_end: bool) -> Run:
+def run_twice(
+    flow: Flow, steps: Any, max_time: float, target: float, members: Array, to_the_end: bool
+) -> tuple[Record, Record]:
     """Records of growth of the ``members`` with ``steps`` and with ``steps // 2`` per strobe (:func:`record_growth`).
 
-    The second march is for members without an orbit whose largest exponent is positive beyond its error. Both marches
-    share one compiled loop.
+    The second march is for members without an orbit whose largest exponent is positive beyond its error; the record of
+    others is empty. Both marches share one compiled loop.
     """
 
     def one(active: Array, steps: Array) -> tuple[Array, Record]:
@@ -335,7 +330,7 @@ def run_twice(flow: Flow, steps: Any, max_time: float, target: float, members: A
         return active & record.bounded & ~record.orbit.found & positive, record
 
     _, both = jax.lax.scan(one, members, jnp.stack([jnp.asarray(steps), jnp.maximum(steps // 2, 1)]))
-    return Run(*(jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1)))
+    return jax.tree.map(lambda x: x[0], both), jax.tree.map(lambda x: x[1], both)
 
 
 class Findings(NamedTuple):
@@ -348,13 +343,13 @@ class Findings(NamedTuple):
     resolved: Array
 
 
-def findings_of(run: Run, period: Any) -> Findings:
+def findings_of(fine: Record, coarse_record: Record, period: Any) -> Findings:
     """The spectra of both marches, the residual of the sum rule, and the result of their comparison.
 
     The exponents of a motion on an orbit are those of the orbit.
     """
-    spectrum, coarse, orbit = spectrum_of(run.fine), spectrum_of(run.coarse), run.fine.orbit
-    residual = sum_rule_residual(run.fine, spectrum)
+    spectrum, coarse, orbit = spectrum_of(fine), spectrum_of(coarse_record), fine.orbit
+    residual = sum_rule_residual(fine, spectrum)
     sound = resolved(spectrum.values, spectrum.errors, residual, period, coarse.values[0], coarse.errors[0])
     values = jnp.where(orbit.found, orbit.exponents, spectrum.values)
     errors = jnp.where(orbit.found, orbit.errors, spectrum.errors)
@@ -388,12 +383,12 @@ def _march(flow: Flow, request: Request, steps: Any, members: Array) -> dict[str
     if wanted == {"paper_estimator"}:
         finite = jnp.all(jnp.isfinite(results["paper_estimator"]), axis=0)
         return results | {"outcome": jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE).astype(jnp.int8)}
-    run = run_twice(flow, steps, max_time, target, members, "lyapunov_history" in wanted)
-    findings = findings_of(run, flow.period)
-    results |= _of_spectrum(run.fine, findings)
+    fine, coarse = run_twice(flow, steps, max_time, target, members, "lyapunov_history" in wanted)
+    findings = findings_of(fine, coarse, flow.period)
+    results |= _of_spectrum(fine, findings)
     if wanted & _SECTION:
-        results |= _of_section(flow, steps, run.fine, findings, members & ("chaos_k01" in wanted))
-    results["outcome"] = _outcome(run.fine, findings, target)
+        results |= _of_section(flow, steps, fine, findings, members & ("chaos_k01" in wanted))
+    results["outcome"] = _outcome(fine, findings, target)
     return {name: results[name] for name in (*request.outputs, "outcome")}
 
 
@@ -402,20 +397,20 @@ def _of_section(flow: Flow, steps: Any, fine: Record, findings: Findings, wanted
     spectrum, coarse, orbit, period = findings.spectrum, findings.coarse, fine.orbit, common_period(flow, fine.state)
     decays = spectrum.values[0] < -STANDARD_ERRORS * spectrum.errors[0] - zero_floor(spectrum.values)
     needed = wanted | ~decays if flow.turns else jnp.ones_like(decays)
-    seen = sample(flow, steps, fine, needed & ~orbit.found)
+    k01, returns = sample(flow, steps, fine, needed & ~orbit.found)
     following = orbit.found | follows(fine.size, fine.used, fine.span, spectrum.values[0])
     resting = may_rest(flow, fine.state)
     # A rest is an orbit of any period, also of clocks that have none in common.
     multiple = jnp.where((period == 0) & decays & following & resting, 1, orbit.multiple)
     evidence = Evidence(
-        spectrum.values, spectrum.errors, coarse.values[0], coarse.errors[0], jnp.abs(findings.residual), seen.k01,
-        fine.bounded, following, multiple, (period == 0) & ~resting, seen.returns, findings.resolved,
+        spectrum.values, spectrum.errors, coarse.values[0], coarse.errors[0], jnp.abs(findings.residual), k01,
+        fine.bounded, following, multiple, (period == 0) & ~resting, returns, findings.resolved,
         may_be_chaotic(flow, fine.state),
     )  # fmt: skip
     return {
         "verdict": judge(evidence, autonomous=not flow.turns),
         # The test is meaningless for a few repeating points: K is set to 0, its limit for regular motion.
-        "chaos_k01": jnp.where(multiple > 0, 0.0, seen.k01),
+        "chaos_k01": jnp.where(multiple > 0, 0.0, k01),
         "period_multiple": multiple.astype(jnp.int32),
     }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -177,27 +177,23 @@ SAMPLES, LONGEST = 1024, 512
 _RETURNS = (0.3, 0.1, 0.03, 0.01)
 
 
-class Sampling(NamedTuple):
-    """K of the 0-1 test, and flags of motions that :func:`returns` finds."""
+def sample(flow: Flow, steps: Any, record: Record, needed: Array) -> tuple[Array, Array]:
+    """K of the 0-1 test over ``SAMPLES`` strobes after the run, and flags of motions that :func:`returns` finds.
 
-    k01: Array
-    returns: Array
-
-
-def sample(flow: Flow, steps: Any, record: Record, needed: Array) -> Sampling:
-    """Sampling of the motions over ``SAMPLES`` strobes after the run; K of the others is 0, of unbounded ones NaN."""
+    K is 0 for motions that are not ``needed``, and NaN for unbounded ones.
+    """
     watched = [i for i in range(flow.size) if i not in (*flow.phases, *flow.cyclic)] or [0]
     needed = needed & record.bounded
 
-    def look() -> Sampling:
+    def look() -> tuple[Array, Array]:
         states, _ = sampled(flow, steps, record.state, record.strobe, SAMPLES)
         section = states[:, jnp.array(watched)]
         finite = jnp.all(jnp.isfinite(section), axis=(0, 1))
         k01 = jnp.where(needed, jnp.where(finite, largest_k01(section), jnp.nan), 0.0)
-        return Sampling(k01, needed & finite & returns(section))
+        return k01, needed & finite & returns(section)
 
-    seen = jax.lax.cond(jnp.any(needed), look, lambda: Sampling(jnp.zeros(needed.shape), jnp.zeros_like(needed)))
-    return seen._replace(k01=jnp.where(record.bounded, seen.k01, jnp.nan))
+    k01, back = jax.lax.cond(jnp.any(needed), look, lambda: (jnp.zeros(needed.shape), jnp.zeros_like(needed)))
+    return jnp.where(record.bounded, k01, jnp.nan), back
 
 
 def returns(section: Array) -> Array:
