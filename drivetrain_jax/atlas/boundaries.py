@@ -71,7 +71,10 @@ def boundaries(atlas: Atlas, system: type[System], searches: Sequence[Search] = 
             fine = polish(criteria, rough, kind, horizontal)[0]
             near = (np.abs(fine - rough) < _LARGEST_SHIFT * zeros.scale).all(axis=1)
             tips = np.where(near[:, None], fine, rough)
-        curves += [_finish(criteria, zeros, kind, curve) for curve in zeros.curves(tips)]
+        for curve in zeros.curves(tips):
+            x = _polish(criteria, zeros, kind, curve)
+            points = dict(zip(atlas.parameters, parameters_at(atlas, x).T, strict=True))
+            curves.append(Boundary(kind, points, _limiting(criteria, x, kind)))
     return tuple(curves)
 
 
@@ -240,13 +243,6 @@ def _chains(count: int, links: Sequence[tuple[int, int]]) -> list[list[int]]:
     return chains
 
 
-def _finish(criteria: Criteria, zeros: ZeroSet, kind: str, curve: np.ndarray) -> Boundary:
-    """Polish the points of a curve with the multiplier itself."""
-    x = _polish(criteria, zeros, kind, curve)
-    points = dict(zip(criteria.atlas.parameters, parameters_at(criteria.atlas, x).T, strict=True))
-    return Boundary(kind, points, _limiting(criteria, x, kind))
-
-
 def _limiting(criteria: Criteria, x: np.ndarray, kind: str) -> np.ndarray:
     """Flags of the points of a curve that bound the stable region."""
     if not criteria.conservative:
@@ -257,12 +253,10 @@ def _limiting(criteria: Criteria, x: np.ndarray, kind: str) -> np.ndarray:
 
 
 def _polish(criteria: Criteria, zeros: ZeroSet, kind: str, x: np.ndarray) -> np.ndarray:
-    """Points with ln|sigma| = 0 near ``x``; ``x`` itself if the multiplier is not simple there."""
+    """Points of a curve where the multiplier itself is on the unit circle; ``x`` where it is not simple."""
     if criteria.conservative:
         return x
-    scale = zeros.scale
-    kinds = [kind] * len(x)
-    best = x.copy()
+    scale, kinds, best = zeros.scale, [kind] * len(x), x.copy()
     for _ in range(_POLISH):
         rates = growth(criteria, best, kinds)
         gradient = rates.gradient * scale

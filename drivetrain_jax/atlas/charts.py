@@ -155,29 +155,23 @@ def results_of_coefficients(c: quartic.Coefficients, rtol: Array, exact: Array |
     """Results of lanes by name, and flags ``unsure`` of lanes to compute again by eigenvalues.
 
     ``exact`` holds the verdicts of Hamiltonian lanes. The interval of rho of every other lane without the flag excludes 1.
-    All results come from one kernel: thirty small kernels repeat the computation of the coefficients, and take up to a
-    quarter longer to run and half as long again to compile.
     """
-    return in_one_kernel(_results_of_coefficients)(c, rtol, exact)
 
+    def results(c: quartic.Coefficients, rtol: Array, exact: Array | None) -> dict[str, Array]:
+        rho, error, unsure = quartic.spectral_radius(c)
+        # A bound at the limit of rounding cannot be improved.
+        unsure = (unsure & (error > 4 * quartic.EPS)) | ~(jnp.abs(rho - 1) > error)
+        verdict = jnp.where(unsure, UNDECIDED, rho > 1).astype(jnp.int8)
+        if exact is not None:
+            rho, error, verdict = exactly(exact, rho, error, verdict)
+            # Hamiltonian cells are decided; for the others eigenvalues may give a better bound.
+            unsure &= exact != 0
+        outcome = jnp.where(error <= 10 * rtol * rho, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET).astype(jnp.int8)
+        decided = {"spectral_radius": rho, "spectral_radius_error": error, "verdict": verdict}
+        return decided | {"outcome": outcome, "unsure": unsure}
 
-def _results_of_coefficients(c: quartic.Coefficients, rtol: Array, exact: Array | None) -> dict[str, Array]:
-    rho, error, unsure = quartic.spectral_radius(c)
-    # A bound at the limit of rounding cannot be improved.
-    unsure = (unsure & (error > 4 * quartic.EPS)) | ~(jnp.abs(rho - 1) > error)
-    verdict = jnp.where(unsure, UNDECIDED, rho > 1).astype(jnp.int8)
-    if exact is not None:
-        rho, error, verdict = exactly(exact, rho, error, verdict)
-        # Hamiltonian cells are decided; for the others eigenvalues may give a better bound.
-        unsure &= exact != 0
-    outcome = jnp.where(error <= 10 * rtol * rho, Outcome.SUCCESS, Outcome.TOLERANCE_NOT_MET).astype(jnp.int8)
-    return {
-        "spectral_radius": rho,
-        "spectral_radius_error": error,
-        "verdict": verdict,
-        "outcome": outcome,
-        "unsure": unsure,
-    }
+    # Thirty small kernels repeat the coefficients, take up to a quarter longer to run and half as long again to compile.
+    return in_one_kernel(results)(c, rtol, exact)
 
 
 def exactly(exact: Array, rho: Array, error: Array, verdict: Array) -> tuple[Array, Array, Array]:

@@ -97,10 +97,6 @@ class Criteria:
         columns = dict(zip(self.atlas.parameters, parameters_at(self.atlas, x).T, strict=True))
         return predicted(_log_determinant, (self.system.models["floquet"].build,), {**self.atlas.fixed, **columns})
 
-    def values(self, x: np.ndarray) -> np.ndarray:
-        """The functions at points, ``(N, d) -> (k, N)``."""
-        return self.derive(self.propagator(x), self.log_determinant(x))
-
     def derive(self, phi: np.ndarray, log_determinant: np.ndarray) -> np.ndarray:
         """The functions from ``Phi`` ``(16, ...)`` and log det Z ``(...)``, ``(k, ...)``."""
         if self.conservative:

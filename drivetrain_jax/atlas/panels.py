@@ -94,7 +94,7 @@ class Atlas:
         """Number of the panel of each point in coordinates, ``(N, d) -> (N,)``; -1 in a gap or outside the domain."""
         numbers = np.full(len(x), -1)
         for number, panel in reversed(list(enumerate(self.panels))):
-            numbers[inside(panel, x)] = number
+            numbers[between(panel.lower, panel.upper, x).all(axis=-1)] = number
         return numbers
 
     def folded(self) -> Atlas:
@@ -168,11 +168,6 @@ def position(panel: Panel | Gap, x: np.ndarray) -> np.ndarray:
     return position_between(panel.lower, panel.upper, x)
 
 
-def grid_positions(panel: Panel | Gap, axes: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Positions in [-1, 1] of the points of a grid, from its ``axes`` ``(N_k,)``."""
-    return [position_between(*ends) for ends in zip(panel.lower, panel.upper, axes, strict=True)]
-
-
 def position_between(lower: np.ndarray, upper: np.ndarray, x: np.ndarray | float) -> np.ndarray:
     """-1 where ``x`` is ``lower``, 1 where it is ``upper``."""
     return np.clip(((x - lower) - (upper - x)) / (upper - lower), -1.0, 1.0)
@@ -191,11 +186,6 @@ def derivative(panel: Panel, order: Sequence[int]) -> np.ndarray:
 def chebyshev(x: np.ndarray, n: int) -> np.ndarray:
     """``T_0 .. T_(n-1)`` at ``x`` in [-1, 1], shape ``(*x.shape, n)``."""
     return np.cos(np.arccos(x)[..., None] * np.arange(n))
-
-
-def inside(panel: Panel | Gap, x: np.ndarray) -> np.ndarray:
-    """Flags of points in coordinates, ``(..., d)``, that lie in the box up to rounding."""
-    return between(panel.lower, panel.upper, x).all(axis=-1)  # pyright: ignore[reportReturnType]
 
 
 def between(lower: np.ndarray, upper: np.ndarray, x: np.ndarray | float) -> np.ndarray:

@@ -125,7 +125,7 @@ def test_boundary_functions_are_products_of_multipliers(atlas):
     criteria = Criteria.of(atlas, CARDAN)
     points = atlas.lower + (atlas.upper - atlas.lower) * np.random.default_rng(1).random((200, 2))
     x = atlas.to_coordinates(points)
-    plus, minus, pair = criteria.values(x)
+    plus, minus, pair = criteria.derive(criteria.propagator(x), criteria.log_determinant(x))
     sigma = criteria.eigenvalues(x)
     product = np.prod([1 - sigma[:, i] * sigma[:, j] for i in range(4) for j in range(i)], axis=0).real
     d = np.exp(criteria.log_determinant(x))
@@ -233,7 +233,7 @@ def test_roots_on_a_line_are_all_sign_changes(atlas):
     value = float(atlas.to_coordinates(np.array([1.0, 1.0]))[0])
     omega = 1 / np.linspace(1 / 2.0, 1 / 0.06, 40_001)
     x = atlas.to_coordinates(np.stack([np.ones_like(omega), omega], axis=-1))
-    signs = criteria.values(x) > 0
+    signs = criteria.derive(criteria.propagator(x), criteria.log_determinant(x)) > 0
     for k, patches in enumerate(patches_of(criteria)):
         found = roots(on_line(patches, 0, value))
         changes = np.flatnonzero(signs[k, 1:] != signs[k, :-1])
