@@ -203,28 +203,6 @@ SHOWN = (
 )
 
 
-def constants(values: Values) -> dict[str, Any]:
-    """The values of ``RESULTS`` by name; the value of ``midshaft_frequency`` is a function of the number of the mode."""
-    element = element_of(values)
-    midshaft = midshaft_frequency(values)
-    mean = values["M_AEM"] if values["element"] == "input" else -values["M_MS"]
-    return {
-        "natural_angular_frequency": element.frequency,
-        "resonance_frequency": element.frequency / math.pi,
-        "mean_inertia": element.mean_inertia,
-        "chi_n": element.chi_n,
-        "c_stiffness": element.c_stiffness,
-        "c_inertia": element.c_inertia,
-        "parametric_excitation": element.c_stiffness - element.c_inertia - element.chi_n,
-        "torsional_stiffness": element.stiffness,
-        "axle_area_moment": element.J_A,
-        "bell_area_moment": element.J_B,
-        "joint_amplitude": joint_amplitude(values),
-        "torque_acceleration": mean / element.mean_inertia,
-        "midshaft_frequency": lambda mode: mode * midshaft,
-    }
-
-
 def _octaves(cosine: Any, count: int) -> list[Any]:
     """cos(x), cos(2 x), cos(4 x), ... from cos(x); the weights 2^-i of the sums outweigh the growth of rounding."""
     terms = [cosine]
@@ -283,44 +261,6 @@ class _Motion(eqx.Module):
         return -2 * self.zeta * self.element.frequency * jnp.sqrt(self._ratio(angles, 1 - 2 * sin(y[0]) ** 2))
 
 
-def flow_model(values: Values) -> Flow:
-    """(25), (26), (29) or (30) as a flow of ``y = (phi, phi'/Omega)``, time in seconds.
-
-    phi'' + 2 zeta Omega sqrt(g) phi' + Omega^2 g phi = (M/Ibar)(1 + ripple)(1 - 3 A_TJ sin 3 phi)/(1 + chi_n cos 2 phi)
-    with g at 2 phi, (25)-(26), or at Theta = 2 pi f t, (29)-(30). The clocks are Theta and, for the input element, the
-    angle of the motor. The default equation is (29) or (30).
-    """
-    name = values["element"]
-    equation = values.get("equation", EQUATIONS[name][1])
-    element = element_of(values)
-    omega, frequency = element.frequency, excitation_frequency(values, element)
-    driven = name == "input"
-    motion = _Motion(
-        element,
-        zeta=values["zeta"],
-        joint=3 * joint_amplitude(values),
-        mean=(values["M_AEM"] if driven else -values["M_MS"]) / (element.mean_inertia * omega),
-        ripple=values["chi_AEM"] if driven else values["chi_MS"],
-        driven=driven,
-        parametric=equation in ("29", "30"),
-        reading=values["torque_reading"],
-    )
-    return Flow(
-        motion.field,
-        start=(values["phi0"], values["velocity0"] / omega),
-        period=1 / frequency,
-        turns=(1, 50 * values["motor_order"] / frequency) if name == "input" else (1,),
-        scale=(1.0, omega),
-        divergence=motion.divergence,
-        fastest=omega,
-    )
-
-
-def history_model(values: Values) -> Flow:
-    """Like :func:`flow_model`, with (25) or (26) as default equation."""
-    return flow_model({"equation": EQUATIONS[values["element"]][0], **values})
-
-
 # Number of equally spaced angles of the quadrature. Its rate of convergence is the distance of the nearest zero or pole of g
 # from the real axis; for coefficients up to 0.99 the error is rounding.
 _NODES = 256
@@ -356,22 +296,6 @@ class _Parametric(eqx.Module):
 
 def _cosine(theta: Any) -> tuple[Any, ...]:
     return (jnp.cos(theta),)
-
-
-def floquet_model(values: Values) -> FloquetModel:
-    """The linear parametric part of (29), (30): phi'' + 2 zeta Omega sqrt(g) phi' + Omega^2 g phi = 0, g at Theta.
-
-    State ``(phi, phi'/Omega)``; clock of the reduced form: Theta in [0, 2 pi].
-    """
-    element = element_of(values)
-    omega, frequency = element.frequency, excitation_frequency(values, element)
-
-    natural = _Parametric(element, values["zeta"], omega, frequency)
-    reduced = _Parametric(element, values["zeta"], omega / (2 * math.pi * frequency), frequency)
-    return FloquetModel(
-        LinearPeriodic(natural.rows_in_time, 1 / frequency, log_determinant=natural.log_determinant),
-        LinearPeriodic(reduced.rows, 2 * math.pi, _cosine, log_determinant=reduced.log_determinant),
-    )
 
 
 class Tripod(System):
@@ -444,23 +368,86 @@ class Tripod(System):
         default_outputs=SHOWN,
     )
     def constants(self) -> dict[str, Any]:
-        """See :func:`constants`."""
-        return constants(self.values)
+        """The values of ``RESULTS`` by name; the value of ``midshaft_frequency`` is a function of the number of the mode."""
+        values = self.values
+        element = element_of(values)
+        midshaft = midshaft_frequency(values)
+        mean = values["M_AEM"] if values["element"] == "input" else -values["M_MS"]
+        return {
+            "natural_angular_frequency": element.frequency,
+            "resonance_frequency": element.frequency / math.pi,
+            "mean_inertia": element.mean_inertia,
+            "chi_n": element.chi_n,
+            "c_stiffness": element.c_stiffness,
+            "c_inertia": element.c_inertia,
+            "parametric_excitation": element.c_stiffness - element.c_inertia - element.chi_n,
+            "torsional_stiffness": element.stiffness,
+            "axle_area_moment": element.J_A,
+            "bell_area_moment": element.J_B,
+            "joint_amplitude": joint_amplitude(values),
+            "torque_acceleration": mean / element.mean_inertia,
+            "midshaft_frequency": lambda mode: mode * midshaft,
+        }
 
     @serves("history", parameters=MOTION, check=check_motion)
     def history_model(self) -> Flow:
         """The flow of (25) or (26), unless another equation is given."""
-        return history_model(self.values)
+        return self._flow(0)
 
     @serves("floquet", parameters=(*SHAPE, "zeta", "equation", "excitation_frequency"), check=check_parametric)
     def floquet_model(self) -> FloquetModel:
-        """The linear parametric part of (29) or (30)."""
-        return floquet_model(self.values)
+        """The linear parametric part of (29), (30): phi'' + 2 zeta Omega sqrt(g) phi' + Omega^2 g phi = 0, g at Theta.
+
+        State ``(phi, phi'/Omega)``; clock of the reduced form: Theta in [0, 2 pi].
+        """
+        values = self.values
+        element = element_of(values)
+        omega, frequency = element.frequency, excitation_frequency(values, element)
+
+        natural = _Parametric(element, values["zeta"], omega, frequency)
+        reduced = _Parametric(element, values["zeta"], omega / (2 * math.pi * frequency), frequency)
+        return FloquetModel(
+            LinearPeriodic(natural.rows_in_time, 1 / frequency, log_determinant=natural.log_determinant),
+            LinearPeriodic(reduced.rows, 2 * math.pi, _cosine, log_determinant=reduced.log_determinant),
+        )
 
     @serves("lyapunov", "poincare", parameters=MOTION, check=check_motion)
     def flow_model(self) -> Flow:
         """The flow of (29) or (30), unless another equation is given."""
-        return flow_model(self.values)
+        return self._flow(1)
+
+    def _flow(self, default: int) -> Flow:
+        """(25), (26), (29) or (30) as a flow of ``y = (phi, phi'/Omega)``, time in seconds.
+
+        phi'' + 2 zeta Omega sqrt(g) phi' + Omega^2 g phi = (M/Ibar)(1 + ripple)(1 - 3 A_TJ sin 3 phi)/(1 + chi_n cos 2 phi)
+        with g at 2 phi, (25)-(26), or at Theta = 2 pi f t, (29)-(30). The clocks are Theta and, for the input element, the
+        angle of the motor. The element has two equations, of which number ``default`` is used if none is given.
+        """
+        values = self.values
+        name = values["element"]
+        equation = values.get("equation", EQUATIONS[name][default])
+        element = element_of(values)
+        omega, frequency = element.frequency, excitation_frequency(values, element)
+        driven = name == "input"
+        motion = _Motion(
+            element,
+            zeta=values["zeta"],
+            joint=3 * joint_amplitude(values),
+            mean=(values["M_AEM"] if driven else -values["M_MS"]) / (element.mean_inertia * omega),
+            ripple=values["chi_AEM"] if driven else values["chi_MS"],
+            driven=driven,
+            parametric=equation in ("29", "30"),
+            reading=values["torque_reading"],
+        )
+        return Flow(
+            motion.field,
+            start=(values["phi0"], values["velocity0"] / omega),
+            period=1 / frequency,
+            turns=(1, 50 * values["motor_order"] / frequency) if name == "input" else (1,),
+            scale=(1.0, omega),
+            divergence=motion.divergence,
+            fastest=omega,
+        )
 
     def vector_field(self, t: Any, y: Array) -> Array:
         """``(phi', phi'')`` of ``y = (phi, phi')`` [rad, rad/s] at the time ``t`` [s]; (25) or (26) by default."""

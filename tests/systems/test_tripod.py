@@ -44,7 +44,7 @@ def test_constants_at_nine_degrees(name, k):
     for field, key in names.items():
         assert float(getattr(e, field)) == pytest.approx(expected[key], rel=1e-12)
     assert float(tripod.joint_amplitude(values)) == pytest.approx(expected["A"], rel=1e-12)
-    excitation = tripod.constants(values)["parametric_excitation"]
+    excitation = tripod.Tripod.of(values).constants()["parametric_excitation"]
     assert float(excitation) == pytest.approx(expected["h"], rel=1e-10)
 
 
@@ -80,7 +80,9 @@ def test_where_chi_n_comes_from():
 def test_field_against_the_plain_equations(equation, chi_n):
     name = oracle.EQUATIONS[equation]
     given = {} if chi_n is None else {"chi_n": chi_n}
-    flow = tripod.flow_model(INPUT | given | {"element": name, "equation": equation, "excitation_frequency": 3000.0})
+    flow = tripod.Tripod.of(
+        INPUT | given | {"element": name, "equation": equation, "excitation_frequency": 3000.0}
+    ).flow_model()
     s = oracle.shaft(name, chi_n=chi_n)
     for strobe, fraction, phi, rate in ((0, 0.0, 0.0, 0.0), (3, 0.21, 0.7, -2e3), (50, 0.9, -2.0, 5e3)):
         y = jnp.array([phi, rate / s.omega])
@@ -93,7 +95,7 @@ def test_field_against_the_plain_equations(equation, chi_n):
 @pytest.mark.parametrize("equation", ["25", "26", "29", "30"])
 def test_divergence_is_the_trace_of_the_jacobian(equation):
     values = INPUT | {"element": oracle.EQUATIONS[equation], "equation": equation, "chi_n": 0.3}
-    flow = tripod.flow_model(values)
+    flow = tripod.Tripod.of(values).flow_model()
     y = jnp.array([0.7, -0.3])
     jacobian = jax.jacfwd(lambda x: flow.vector(4, 0.3, x))(y)
     assert float(jnp.trace(jacobian)) == pytest.approx(float(flow.divergence(flow.angles(4, 0.3), y)), rel=1e-12)
@@ -113,7 +115,7 @@ def test_readings_of_the_torque_sums():
 
 def test_phase_does_not_drift():
     """The motor's angle after 50,000 strobes agrees with rational arithmetic; from the time it would be off by 1e-11."""
-    flow = tripod.flow_model(INPUT | {"excitation_frequency": 3066.5})
+    flow = tripod.Tripod.of(INPUT | {"excitation_frequency": 3066.5}).flow_model()
     turns = Fraction(float(flow.turns[1]))
     for strobe in (1, 12_345, 50_000, 5_000_000):
         exact = float((turns * strobe) % 1)
@@ -126,11 +128,11 @@ def test_determinant_against_quadrature():
     for chi in (0.0026, 0.3, 0.45):
         values = INPUT | {"chi_n": chi, "excitation_frequency": 3066.5}
         expected = oracle.determinant("input", 0.0016, 3066.5, chi)
-        assert float(jnp.exp(tripod.floquet_model(values).natural.log_determinant())) == pytest.approx(
+        assert float(jnp.exp(tripod.Tripod.of(values).floquet_model().natural.log_determinant())) == pytest.approx(
             expected, rel=1e-13
         )
     both = INPUT | {"chi_n": np.array([0.3, 0.45]), "excitation_frequency": 3066.5}
-    batch = tripod.floquet_model(both).natural.log_determinant()
+    batch = tripod.Tripod.of(both).floquet_model().natural.log_determinant()
     assert batch.shape == (2,)
     assert float(jnp.exp(batch[1])) == pytest.approx(expected, rel=1e-13)
 
