@@ -51,11 +51,13 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
     """The reduced form in equal steps, predicted from the order of the solver and refined until two counts agree."""
     rtol, build = request.options["rtol"], system.models["floquet"].build
     solver = getattr(diffrax, request.options["solver"])()
+    order = solver.order(diffrax.ODETerm(lambda t, y, args: y))
+    # The prediction is fitted for order 8; a lower order needs more steps for a smaller tolerance.
+    more = rtol ** (1 / 8 - 1 / order)
 
     def solve(values: Mapping[str, Any], steps: Array) -> dict[str, Array]:
         model = build(values)
         shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in jax.tree.leaves(dict(values)) if not isinstance(x, str)))
-        order = solver.order(model.reduced)
 
         def one(point: Mapping[str, Any], steps: Array) -> Array:
             parts = [_in_equal_steps(part, solver, steps) for part in build(point).reduced.parts]
@@ -70,14 +72,11 @@ def equal_steps(system: type[System], request: Request) -> tuple[Solver, ...]:
         return results(z, request.outputs, rtol, model)
 
     def effort(columns: Mapping[str, Any]) -> np.ndarray:
-        # Fitted for order 8; a lower order needs more steps for a smaller tolerance.
-        more = rtol ** (1 / 8 - 1 / solver.order(diffrax.ODETerm(lambda t, y, args: y)))
         steps = more * steps_needed(system, columns, rtol)
         return np.where(steps <= MAX_STEPS, steps, np.inf)
 
     def steps(values: Mapping[str, Any]) -> Array:
-        order = solver.order(diffrax.ODETerm(lambda t, y, args: y))
-        count = rtol ** (1 / 8 - 1 / order) * jnp.ceil(STEPS * traced_panels(build, values, rtol))
+        count = more * jnp.ceil(STEPS * traced_panels(build, values, rtol))
         return jnp.minimum(count, MAX_STEPS).astype(jnp.int64)
 
     name = f"diffrax: {request.options['solver']}, equal steps"

@@ -169,11 +169,6 @@ def sweeps(
     return {name: arrange(value) for name, value in results.items()}
 
 
-def worst(outcome: Array) -> Array:
-    """The worse outcome of both directions, ``(L, 2, ...) -> (L, ...)``."""
-    return jnp.max(outcome, axis=1)
-
-
 # All orbits of the drive's period on the branch of a sweep, stable or not, with the folds and period doublings.
 #
 # The branch runs through the first motion of period one of the sweep up. Continuation by arc length goes both ways to
