@@ -358,9 +358,12 @@ def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[An
 def _overrides(options: argparse.Namespace) -> dict[str, Any]:
     """Entries of the scene that the command line replaces."""
     from drivetrain_jax.runs.physical import PARTS, read_table
+    from drivetrain_jax.runs.toml import read
 
     table = {} if options.data is None else read_table(options.data)
-    entries = {name if name == PARTS else f"fixed.{name}": value for name, value in table.items()}
+    own = read(options.scene)[0].get("fixed") if table else None
+    table = {n: value for n, value in table.items() if not (isinstance(own, dict) and n in own)}
+    entries = {n if n == PARTS else f"fixed.{n}": value for n, value in table.items()}
     return entries | assignments(options.set, "--set")
 
 

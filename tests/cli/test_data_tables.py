@@ -46,16 +46,16 @@ def test_a_shaft_from_a_table_has_its_critical_speeds(tmp_path, capsys, kind):
         assert stiff.parameters["k_A"] == 5e7 and stiff.parameters["k_D"] == 5e6
 
 
-def test_a_scene_takes_a_table_and_the_command_line_overrides_it(tmp_path, capsys):
+def test_a_scene_overrides_its_table_and_the_command_line_both(tmp_path, capsys):
     scene = tmp_path / "shaft.toml"
-    axis = '[axes]\nk_D = { values = [1e6, "5 MN/m"] }\n'
+    axis = '[axes]\nk_D = { values = [1e6, "5 MN/m"] }\n[fixed]\nk_A = 1e6\n'
     scene.write_text(f'system = "bicardan"\nanalysis = "critical_speeds"\noutputs = ["critical_speed"]\n{axis}')
     table = written(tmp_path / "shaft.csv", rows=[row[:-1] for row in ROWS])
     common = [str(scene), "--out", str(tmp_path / "s.nc"), "--data", str(table), "--set", "options.modes=1"]
-    assert main(["run", *common, "--set", "fixed.k_A=1e6"]) == 0
+    assert main(["run", *common]) == 0
     assert main(["status", *common, "--set", "fixed.k_A=1e6", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["state"] == "complete"
-    assert main(["status", *common, "--json"]) == 0
+    assert main(["status", *common, "--set", "fixed.k_A=5e6", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["state"] == "stale"
 
 
