@@ -66,7 +66,8 @@ def _about_codes(dataset: xr.Dataset, variable: xr.DataArray, ranges: bool) -> I
         yield f"{_capital(name)}: {value_text(variable, variable.values.item()) or 'unknown'}."
         return
     shares = {word.replace("_", " "): float(np.mean(variable.values == code)) for code, word in meanings.items()}
-    yield f"{_capital(name)}: " + ", ".join(f"{word} {_share(share)}" for word, share in shares.items() if share) + "."
+    parts = ", ".join(f"{word} {_share(share)}" for word, share in shares.items() if share)
+    yield f"{_capital(name)} at the points computed: {parts}."
     axis = _main_axis(dataset, variable) if ranges else None
     exact = axis is not None and f"unstable_{axis.name}" in dataset.coords
     if shares.get("undecided"):

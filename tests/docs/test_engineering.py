@@ -52,7 +52,7 @@ def test_every_command_gives_the_answer_of_the_page(tmp_path, monkeypatch, capsy
             assert agree(answer, shown), f"{line}\n{shown}"
     page = Path("report.html").read_text()
     # The three narrow ranges cover 41 of 3800 rpm.
-    assert "Stability of the equilibrium: stable 98.9" in page
+    assert "Stability of the equilibrium at the points computed: stable 98.9" in page
     for answer in (
         "Stable from speed = 1429.11 rpm to speed = 2270.73 rpm",
         "by a factor 1.01",

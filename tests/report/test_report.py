@@ -56,7 +56,7 @@ def test_one_page_joins_results_and_needs_nothing_else(files, tmp_path):
     assert len(set(page.ids)) == len(page.ids)
     text = " ".join(page.words)
     assert "Two & one" in text and HOSTILE in text
-    assert "Stability of the equilibrium: stable 50 %, unstable 50 %." in text
+    assert "Stability of the equilibrium at the points computed: stable 50 %, unstable 50 %." in text
     assert "Unstable at Omega = 1.41 to 1.415." in text
     first = float(dt.open_result(files[1]).critical_speed[0])
     assert f"Critical speed: {first:.6g}" in text and f"{first:.6g}" in page.words
