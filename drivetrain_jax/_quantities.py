@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError, shown
 
-_QUOTIENT = re.compile(r"\s*([+-]?\d{1,9})\s*/\s*([1-9]\d{0,8})\s*")
+_QUOTIENT = re.compile(r"\s*([+-]?\d{1,9}(?:\.\d{1,9})?)\s*/\s*([1-9]\d{0,8}(?:\.\d{1,9})?)\s*")
 # First code of ``outcome`` without a value.
 FIRST_FAILURE = 2
 
@@ -59,7 +59,7 @@ class Parameter:
     usual: float = math.inf
     #: 0 is allowed below ``lower``.
     or_zero: bool = False
-    #: A quotient of integers is allowed: ``"41/11"``, the teeth of two gears.
+    #: A quotient is allowed: ``"11/41"``, the teeth of two gears, or ``"1/3.7"``.
     fraction: bool = False
 
     @property
@@ -114,7 +114,7 @@ class Parameter:
     def _check_number(self, value: object, label: str) -> float | int:
         written = isinstance(value, str)
         if isinstance(value, str) and self.fraction and (quotient := _QUOTIENT.fullmatch(value)):
-            value = int(quotient[1]) / int(quotient[2])
+            value = float(quotient[1]) / float(quotient[2])
         if isinstance(value, str):
             value = self._in_units(value, label)
         elif isinstance(value, Decimal) or (isinstance(value, Real) and not isinstance(value, (bool, int, float))):

@@ -145,7 +145,7 @@ RATTLE = Resonances(
 )
 
 
-# Predicted parametric resonances of a driveline; the joints modulate its matrices twice a turn of the driven end.
+# Predicted parametric resonances of a driveline; the joints modulate its matrices twice a turn of the driving end.
 
 # Lowest modes with predictions.
 _MODES = 4
@@ -256,7 +256,7 @@ def orders_of(system: str, values: Mapping[str, Any], further: Sequence[float] =
     known, names = _own_orders(system, values), {f"order {n:.6g}": float(n) for n in further}
     if not names:
         return known
-    known = known or Orders({"driveline": "driven end", "planetary": "carrier"}.get(system, "shaft"), {})
+    known = known or Orders({"driveline": "driving end", "planetary": "carrier"}.get(system, "shaft"), {})
     return replace(known, per_turn={**known.per_turn, **names})
 
 
@@ -273,7 +273,7 @@ def _own_orders(system: str, values: Mapping[str, Any]) -> Orders | None:
         speeds = np.cumprod([1.0, *np.abs(ratio or np.ones(count))])
         turns = sorted({round(float(speed), 12) for speed, angle in zip(speeds, beta, strict=False) if angle != 0})
         names = {f"order {n * s:.4g} (joints)": n * s for s in turns for n in (2, 4)}
-        return Orders("driven end", names) if names else None
+        return Orders("driving end", names) if names else None
     mesh, angles = values.get("carrier_order"), values.get("planet_angle")
     if system == "planetary" and isinstance(mesh, (int, float)) and angles:
         meshes = {f"mesh order {k}": float(k * mesh) for k in (1, 2, 3)}

@@ -280,9 +280,13 @@ def _in_units(value: Any, units: str, wanted: str) -> Any:
 
 def _varied(system: str, analysis: str, given: Mapping[str, Any]) -> str | None:
     """The parameter that has a range, a pair, in a question about stability; None without one."""
-    known = described(get_system(system)) if analysis == "floquet" else {}
+    known = described(get_system(system))
     pairs = (name for name, value in given.items() if isinstance(value, tuple) and len(value) == 2)
-    return next((name for name in pairs if name in known and known[name].is_number and not known[name].listed), None)
+    varied = next((name for name in pairs if name in known and known[name].is_number and not known[name].listed), None)
+    if varied and analysis != "floquet":
+        ends = ":".join(map(str, given[varied]))
+        raise InputError(f"{varied} = {ends}: a range; expected a number (floquet searches a range, a scene has axes)")
+    return varied
 
 
 def _least_stable(system: str, name: str, given: Mapping[str, Any], asked: Mapping[str, Any]) -> PointResult:

@@ -2,7 +2,7 @@
 
 Own derivation, docs/theory/driveline.md, whose equation numbers are used here. Element i = 0..N-1, counted from the driven
 end: a joint (angle beta_i, phase_i of its yokes), then the ratio r_i, then the shaft k_i, c_i, then the inertia J_i at its
-end; the last end is free. Time is the rotation tau = speed t of the driven end; the prime is d/dtau. theta_i is the twist
+end; the last end is free. Time is the rotation tau = speed t of the driving end; the prime is d/dtau. theta_i is the twist
 of shaft i, a_i = Psi_i + x_i the absolute rotation of J_i, and Psi_i that of the rigid chain. All functions broadcast over
 entries of any common shape.
 """
@@ -59,7 +59,7 @@ _LISTS = ("k", "c", "J", "beta", "phase", "ratio")
 # Gears and the common period of the joints.
 
 
-# Most turns of the driven end in a period, and the largest denominator of a ratio. Two fractions with denominators up to
+# Most turns of the driving end in a period, and the largest denominator of a ratio. Two fractions with denominators up to
 # this one differ by 1e-6, so a number is one of them only if it is meant.
 MOST_TURNS, _DENOMINATORS = 24, 1000
 _EPS = float(np.finfo(float).eps)
@@ -223,7 +223,7 @@ def check(fixed: Values) -> None:
     if speeds and _half_turns(speeds) is None:
         raise ValueError(
             f"ratio = {list(ratio)}: the joints have no common period of up to {MOST_TURNS} turns; expected ratios of few "
-            'teeth between joints, such as "41/11"'
+            'teeth between joints, such as "11/41"'
         )
 
 
@@ -326,7 +326,7 @@ def phasing_sentence(values: Values, parameters: Values) -> str:
     speed = parameters.get("speed")
     mean = abs(math.prod(parameters.get("ratio") or (1.0,)))
     rpm = f", {part * speed * mean / RPM:.4g} rpm at {speed * mean / RPM:.5g} rpm" if speed else ""
-    phases = ", ".join(f"{np.degrees(p):.4g}" for p in values["best_phase"])
+    phases = ", ".join(f"{round(np.degrees(p), 2):.4g}" for p in values["best_phase"])
     best = f"with the phases [{phases}] deg by {round(100 * least, 9):.4g} %"
     if part - least <= 1e-9 * part + 1e-12:
         best = "no phases make it less"
@@ -336,7 +336,7 @@ def phasing_sentence(values: Values, parameters: Values) -> str:
 _CHAIN = ("speed", *_LISTS)
 PHYSICAL = PhysicalData(TUBES, stiffness_of_tubes("k"))
 
-SHAFT = Dimension("shaft", "number of the shaft from the driven end", ())
+SHAFT = Dimension("shaft", "number of the shaft from the driving end", ())
 _LIST = {"listed": True, "lower": 0.0}
 _NONE: dict[str, Any] = {"default": (), "listed": True}
 
@@ -363,7 +363,7 @@ class Driveline(System):
     state_axis = displacements = SHAFT
     torque_units = "N m"
 
-    speed: Number = parameter("rad/s", "speed of the driven end", **POSITIVE)
+    speed: Number = parameter("rad/s", "speed of the driving end", **POSITIVE)
     k: Entries = parameter("N m/rad", "stiffness of the shafts", open_lower=True, **_LIST)
     c: Entries = parameter("N m s/rad", "damping of the shafts", **_LIST)
     J: Entries = parameter("kg m2", "inertias at the ends of the shafts", open_lower=True, **_LIST)
@@ -378,7 +378,7 @@ class Driveline(System):
         **_NONE,
     )
     phase: Entries = parameter("rad", "angles of the input yokes from the normal of the plane of their joint", **_NONE)
-    ratio: Entries = parameter("1", 'ratios of the gears behind the joints, such as "41/11"', fraction=True, **_NONE)
+    ratio: Entries = parameter("1", 'output over input speed of the gears, such as "11/41"', fraction=True, **_NONE)
     theta_0: Entries = parameter("rad", "twists of the shafts at tau = 0", **_NONE)
     theta_rate_0: Entries = parameter("1", "d theta/d tau of the shafts at tau = 0", **_NONE)
 
@@ -569,7 +569,7 @@ class Driveline(System):
         return Flow(Partial(type(self)._components, self, period / (2 * math.pi)), start, period=period, turns=(1,))
 
     def _components(self, unit: Any, angles: Components, y: Any) -> tuple[Any, ...]:
-        """The components of ``y'``; the driven end turns by ``unit`` while the clock turns by 1."""
+        """The components of ``y'``; the driving end turns by ``unit`` while the clock turns by 1."""
         return tuple(self.vector_field(unit * angles[0], y))
 
     @serves("floquet", check=check, parameters=_CHAIN)

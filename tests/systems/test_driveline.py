@@ -162,7 +162,7 @@ def test_frequencies_of_a_geared_chain_are_generalised_eigenvalues():
 
 
 @pytest.mark.parametrize(
-    ("ratio", "turns"), [((), 0.5), ((1, 1.5, 1, 1), 1.0), ((2, 1, 1, 1), 0.25), ((1, "41/11", 1, 1), 5.5)]
+    ("ratio", "turns"), [((), 0.5), ((1, 1.5, 1, 1), 1.0), ((2, 1, 1, 1), 0.25), ((1, "4.1/1.1", 1, 1), 5.5)]
 )
 def test_period_follows_from_the_ratios_before_the_joints(ratio, turns):
     shaft = dt.Driveline(speed=9.0, k=[9.0] * 4, c=[0.0] * 4, J=[1.0] * 4, beta=[0.0, 0.2, 0.3, 0.0], ratio=ratio)
@@ -295,14 +295,14 @@ def test_undamped_multipliers_are_on_the_circle_outside_tongues():
 
 @pytest.mark.full
 def test_energy_is_balanced_without_damping():
-    """Kinetic and elastic energy plus the work at the driven end, over 1,000 turns of the nonlinear field."""
+    """Kinetic and elastic energy plus the work at the driving end, over 1,000 turns of the nonlinear field."""
     case = CASES["ref2"]
     shaft = of_case("ref2", c=[0.0] * 3)
     n, w = 3, case["speed"]
 
     def extended(tau, y):
         slopes = shaft.vector_field(tau, y[:-1])
-        # No joint at the driven end: the source feels the first torque.
+        # No joint at the driving end: the source feels the first torque.
         return jnp.append(slopes, shaft.k[0] * y[0] / w**2)
 
     field = jax.jit(extended)
@@ -410,6 +410,8 @@ def test_the_answer_on_phasing_agrees_with_published_rules():
     well = rotation(["5 deg", "4 deg"], [0.0, "90 deg"])
     rho = math.tan(math.radians(3.0024) / 2) ** 2
     assert well.speed_variation == pytest.approx(4 * rho / (1 - rho**2), rel=1e-4)
+    with pytest.raises(dt.InputError, match="600 rpm:900 rpm: a range"):
+        rotation(["5 deg"], [0.0], speed=("600 rpm", "900 rpm"))
     badly = rotation(["30 deg", "30 deg"], [0.0, 0.0], speed="600 rpm")
     assert badly.speed_variation == pytest.approx(4 / 3 - 3 / 4, rel=1e-12)
     np.testing.assert_allclose(badly.best_phase, [0.0, math.pi / 2], rtol=1e-12)
@@ -518,7 +520,7 @@ def test_a_table_of_parts_is_a_driveline(tmp_path):
     assert found.parameters["k"][1] == pytest.approx(tube, rel=1e-12)
     assert found.parameters["J"] == pytest.approx((0.03, 0.03, 0.05, 8.0), rel=1e-12)
     assert found.parameters["ratio"][3] == 11 / 41
-    # Joints turn at the speed of the driven end: their orders are 2 and 4.
+    # Joints turn at the speed of the driving end: their orders are 2 and 4.
     first = found.natural_frequency[1]
     assert set(found.crossings) == {"order 2 (joints)", "order 4 (joints)"}
     assert found.crossings["order 2 (joints)"][1] == pytest.approx(30 * first, rel=1e-12)
@@ -575,4 +577,4 @@ def test_orders_follow_from_the_speed_of_each_joint():
     engine = orders_of("driveline", straight, (2.0, 0.5))
     assert engine is not None and engine.per_turn == {"order 2": 2.0, "order 0.5": 0.5}
     attrs = {"system": "driveline", "options": json.dumps({"orders": [6]}), "fixed_parameters": "{}"}
-    assert stored_orders(attrs) == Orders("driven end", {"order 6": 6.0})
+    assert stored_orders(attrs) == Orders("driving end", {"order 6": 6.0})
