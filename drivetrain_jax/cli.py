@@ -183,7 +183,7 @@ _COMMANDS: dict[str, tuple[str, tuple[Any, ...]]] = {
         ("--proof", {"action": "store_true", "help": "compute the proved bounds of an atlas again (seconds)"}),
     )),
     "export": ("write a Zarr store as one HDF5 file, or a result as CSV", (
-        _file("store", "RESULT", "a Zarr store, or with --csv any result on a grid"),
+        _file("store", "RESULT", "a Zarr store, or with --csv a result file on a grid"),
         _file("file", "FILE.nc", "HDF5 file to write", nargs="?"),
         _argument("--csv", "TABLE.csv", nargs="?", const="",
                text="write a table (default: RESULT.csv): one row a point, units in the header, codes as words"),

@@ -233,7 +233,7 @@ class _Words(BackendArray):
 
 def write_csv(source: Path, out: Path) -> int:
     """Write the result ``source`` as the table ``out``, see :meth:`DrivetrainAccessor.table`; returns its number of rows."""
-    from drivetrain_jax.store.consolidate import open_result
+    from drivetrain_jax.runs.output import open_result
     from drivetrain_jax.store.files import move_into_place
 
     dataset = open_result(source)

@@ -65,3 +65,12 @@ def test_wrong_names_leave_nothing_behind(file, tmp_path, capsys):
         assert main(["export", *arguments]) == 2
         assert word in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_file_is_not_exported(file, tmp_path, capsys):
+    content, bad = bytearray(file.read_bytes()), tmp_path / "bad.nc"
+    content[content.find(dt.open_result(file).critical_speed.values.tobytes())] ^= 1
+    bad.write_bytes(content)
+    assert main(["export", str(bad), "--csv"]) == 2
+    assert "damaged (critical_speed)" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.nc"]
