@@ -185,7 +185,7 @@ def verify(path: Path) -> Report:
             present = np.flatnonzero(zarr_store.done(store)).tolist()
             read = partial(zarr_store.read, store, zarr_store.shards_of(store))
         intact = sum(read(number) is not None for number in present)
-        lines = [f"unfinished: {intact} of {len(present)} blocks are intact"]
+        lines = [f"unfinished: {intact} of {len(present)} finished blocks are intact"]
         lines += ["the run that resumes computes the others again"] if intact < len(present) else []
         return Report(tuple(lines), complete=False)
     if zarr_store.is_store(path):
@@ -216,5 +216,5 @@ def _report(damaged: list[str] | None, findings: list[Finding], agreed: str, bef
     if damaged:
         names = checksums.named(damaged)
         line = f"checksums: {len(damaged)} differ: {names}"
-        problem = f"{before}{names}: damaged; restore the file or compute it again"
+        problem = f"{before}{names}: damaged, or written by another program; restore the file or compute it again"
     return Report((line, *map(str, findings)), problem)

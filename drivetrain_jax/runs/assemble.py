@@ -280,7 +280,7 @@ def export(store: Path, out: Path) -> int:
     if not zarr_store.is_store(store):
         raise InputError(f"store = {str(store)!r}: not a Zarr store; give one of `drivetrain run --store zarr`")
     if not zarr_store.is_sealed(store):
-        raise _damaged(store, "its attributes are damaged, or it is not finished")
+        raise _damaged(store, "its attributes are damaged, or it is unfinished or of another program")
     if out.exists() or not out.parent.is_dir() or PartsFolder(out).holds_work():
         raise InputError(f"out = {str(out)!r}: expected a new file in an existing folder, without unfinished work")
     attrs, layout, shards = zarr_store.attributes(store), zarr_store.layout(store), zarr_store.shards_of(store)

@@ -138,7 +138,7 @@ def find(job: Job, path: Path) -> ReusableResult:
         kept = ~(outcome == Outcome.LOST).any(axis=tuple(range(1, outcome.ndim)))
         theirs, ours = theirs[kept], ours[kept]
     if not theirs.size:
-        raise NotReusable(path, "holds none of the points", "expected a result that shares some")
+        raise NotReusable(path, "holds none of the points", "expected one that shares points and fixed values")
     wanted = set(scene.request.outputs) <= set(job.scene.request.outputs)
     is_covered = wanted and np.unique(theirs).size == grid.size
     stored = tuple(variable.name for variable in result_variables(job.scene))

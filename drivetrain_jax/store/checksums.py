@@ -54,7 +54,7 @@ def unreadable(path: Path) -> InputError:
     if path.suffix == ".parts":
         return InputError(f"file = {str(path)!r}: a folder of unfinished work; give {str(path.with_suffix(''))!r}")
     if (path / "zarr.json").is_file():
-        return InputError(f"file = {str(path)!r}: a Zarr store; give the file that `drivetrain export` makes of it")
+        return InputError(f"file = {str(path)!r}: a Zarr store; use xarray.open_zarr, or `drivetrain export`")
     what = (
         "not a readable netCDF4/HDF5 file" if path.is_file() else "is a folder" if path.is_dir() else "does not exist"
     )

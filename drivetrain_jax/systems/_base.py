@@ -353,9 +353,9 @@ class System(eqx.Module):
         _check_names(cls)
         if "atlas" in cls.models and "floquet" not in cls.models:
             raise ValueError(f"models of {cls.name}: atlas needs floquet as well")
-        for analysis in {"history", "forced"} & cls.models.keys():
-            if not cls.state or (analysis == "forced" and cls.displacements is None):
-                raise ValueError(f"models of {cls.name}: {analysis} needs state, and forced displacements")
+        for analysis, needed in (("history", "state"), ("forced", "state"), ("forced", "displacements")):
+            if analysis in cls.models and not getattr(cls, needed):
+                raise ValueError(f"models of {cls.name}: {analysis} needs {needed}, an attribute of the class")
 
     def __new__(cls, *values: Any, **given: Any) -> Any:
         """A new system; raises :class:`~drivetrain_jax.InputError` for a name that is no parameter."""

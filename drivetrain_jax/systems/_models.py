@@ -170,7 +170,7 @@ class LinearPeriodic(eqx.Module):
         """``rows(*basis)``; raises :class:`~drivetrain_jax.InputError` unless they are as many as the entries of each."""
         rows = self.rows(*basis)
         if not isinstance(rows, (tuple, list)) or not all(isinstance(row, (tuple, list)) for row in rows):
-            raise InputError(f"rows: {type(rows).__name__}; expected tuples of tuples, ((a, b), (c, d)) for two states")
+            raise InputError(f"rows: got {type(rows).__name__}, expected tuples ((a, b), (c, d)) for two states")
         for i, row in enumerate(rows):
             if len(row) != len(rows):
                 raise InputError(f"rows[{i}]: {len(row)} entries; expected {len(rows)}, as many as there are rows")

@@ -163,7 +163,7 @@ def test_breakpoints_outside_of_the_period_are_refused(breakpoints, message):
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        (jnp.eye(2), r"rows: \w*Array\w*; expected tuples of tuples, \(\(a, b\), \(c, d\)\) for two states"),
+        (jnp.eye(2), r"rows: got \w*Array\w*, expected tuples \(\(a, b\), \(c, d\)\) for two states"),
         (((0.0, 1.0), (1.0,)), r"rows\[1\]: 1 entries; expected 2, as many as there are rows"),
     ],
 )

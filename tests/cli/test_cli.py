@@ -220,7 +220,7 @@ def test_verify(cli):
     code, _, err = cli("verify", "r.nc")
     assert (code, len(err)) == (2, 1) and "not a readable" in err[0]
     cli("run", "scene.toml", "--out", "u.nc", "--set", "analysis=broken", "--quiet")
-    assert cli("verify", "u.nc") == (3, "unfinished: 0 of 0 blocks are intact\n", [])
+    assert cli("verify", "u.nc") == (3, "unfinished: 0 of 0 finished blocks are intact\n", [])
     code, _, err = cli("verify", "nothing.nc")
     assert (code, len(err)) == (2, 1) and "does not exist" in err[0]
 

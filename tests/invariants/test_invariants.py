@@ -216,8 +216,8 @@ def test_verify_unfinished_work(tmp_path):
     folder.close()
     report = verify(tmp_path / "r.nc")
     assert (report.problem, report.complete) == ("", False) and report.lines == (
-        "unfinished: 2 of 2 blocks are intact",
+        "unfinished: 2 of 2 finished blocks are intact",
     )
     part = next(folder.path.glob("0*.npz"))
     part.write_bytes(part.read_bytes()[:-1])
-    assert verify(tmp_path / "r.nc").lines[0] == "unfinished: 1 of 2 blocks are intact"
+    assert verify(tmp_path / "r.nc").lines[0] == "unfinished: 1 of 2 finished blocks are intact"

@@ -252,7 +252,7 @@ def test_unfinished_work_is_opened_and_counted(grid_scene, tmp_path):
     assert 0 < partial.attrs["points_done"] == there.sum() == done < 410
     assert partial["wave"].values[there].tobytes() == whole["wave"].values[there].tobytes()
     report = verify(path)
-    assert not report.complete and re.fullmatch(r"unfinished: ([1-9]\d*) of \1 blocks are intact", str(report))
+    assert not report.complete and re.fullmatch(r"unfinished: ([1-9]\d*) of \1 finished blocks are intact", str(report))
     chunks = (tmp_path / "r.zarr.parts" / "store" / "value" / "c").rglob("*")
     next(p for p in chunks if p.is_file()).write_bytes(b"rubbish")
     assert "the run that resumes computes the others again" in str(verify(path))

@@ -129,7 +129,7 @@ def test_a_failure_keeps_the_old_file(tmp_path, monkeypatch, step):
     ("name", "file", "told"),
     [
         ("r.nc.parts", "plan.json", "a folder of unfinished work; give .*r.nc'$"),
-        ("r.zarr", "zarr.json", "a Zarr store; give the file that `drivetrain export` makes of it$"),
+        ("r.zarr", "zarr.json", "a Zarr store; use xarray.open_zarr, or `drivetrain export`$"),
         ("r", "anything", "is a folder; give a result written by `drivetrain run`$"),
     ],
 )
