@@ -275,8 +275,8 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def written_units(units: str) -> str:
-    """A unit of UDUNITS in common notation: ``kg m²`` for ``kg m2``, ``µm`` for ``um``."""
-    powers = re.sub(r"(?<=[A-Za-z])-?\d+", lambda power: power[0].translate(SUPERSCRIPTS), units)
+    """A unit of UDUNITS in common notation: ``kg m²`` for ``kg m2`` or ``kg m^2``, ``µm`` for ``um``."""
+    powers = re.sub(r"(?<=[A-Za-z])\^?(-?\d+)", lambda power: power[1].translate(SUPERSCRIPTS), units)
     return re.sub(r"\bu(?=m\b)", "\u00b5", powers)
 
 

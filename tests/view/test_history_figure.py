@@ -87,6 +87,7 @@ def test_nothing_to_plot_is_an_input_error():
         ("1", "1"),
         ("m2", "m²"),
         ("kg m2", "kg m²"),
+        ("N/m^3", "N/m³"),
         ("kg/m3", "kg/m³"),
         ("N m/rad", "N m/rad"),
         ("1/s", "1/s"),
