@@ -381,7 +381,8 @@ def history(system: System, *, outputs: Sequence[str] | None = None, **options: 
 def lyapunov(system: System, *, outputs: Sequence[str] | None = None, **options: Any) -> Result:
     """Lyapunov spectrum [1/s], falling, with its standard error, the residual of the sum rule and a verdict.
 
-    Args as of :func:`floquet`; options ``standard_error``, ``max_time`` [s], ``steps``. No derivatives.
+    Args as of :func:`floquet`; options ``standard_error``, ``steps``, ``max_time`` [s] (default 1; slow systems need more).
+    Verdicts from 0: fixed_point, periodic, quasi_periodic, parametrically_unstable, chaotic, undecided. No derivatives.
 
     >>> import drivetrain_jax as dt
     >>> shaft = dt.Tripod(element="input", beta=0.157, zeta=0.0016)
