@@ -98,16 +98,24 @@ class Disks:
         return np.linalg.solve(np.eye(4) - monodromy, ends[0])
 
     def periodic_nonlinear(self, guess):
-        found = root(lambda y: self.flow(self.nonlinear, y).y[:, -1] - y, guess, tol=1e-13)
+        """Central differences, because the one-sided ones of SciPy stall at 1e-10 without damping."""
+        found = root(
+            lambda y: self.flow(self.nonlinear, y).y[:, -1] - y,
+            guess,
+            jac=lambda y: self.monodromy(y) - np.eye(4),
+            tol=1e-13,
+        )
         assert np.abs(found.fun).max() < 1e-10
         return found.x
 
-    def spectral_radius(self, start, step=1e-5):
+    def monodromy(self, start, step=1e-5):
         def end(y):
             return self.flow(self.nonlinear, y).y[:, -1]
 
-        columns = [(end(start + step * e) - end(start - step * e)) / (2 * step) for e in np.eye(4)]
-        return np.abs(np.linalg.eigvals(np.array(columns).T)).max()
+        return np.array([(end(start + step * e) - end(start - step * e)) / (2 * step) for e in np.eye(4)]).T
+
+    def spectral_radius(self, start):
+        return np.abs(np.linalg.eigvals(self.monodromy(start))).max()
 
     def to_angles(self, y):
         """(theta, theta') at tau = 0."""
