@@ -22,7 +22,7 @@ import xarray as xr
 import drivetrain_jax
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
-from drivetrain_jax.datasets.figure import table
+from drivetrain_jax.datasets.accessor import write_csv
 from drivetrain_jax.runs.atlas_chart import chart
 from drivetrain_jax.runs.output import status
 from drivetrain_jax.runs.run import Incomplete, ProgressLine, run_to_file
@@ -100,7 +100,7 @@ def draw(item: Item, results: Sequence[Path], figure: Path) -> None:
         return
     datasets = [open_result(path) for path in results]
     if datasets[0].attrs["analysis"] == "parameters" and datasets[0]["outcome"].size == 1:
-        figure.with_suffix(".csv").write_text(table(results[0], None, ","))
+        write_csv(results[0], figure.with_suffix(".csv"))
         return
     if datasets[0].attrs["analysis"] == "atlas":
         datasets = [chart(ds, item.part, CELLS).assign_attrs(title=item.title) for ds in datasets]
@@ -112,8 +112,11 @@ def shown(item: Item, folder: Path) -> str:
     values = folder / f"{item.name}.csv"
     if not values.exists():
         return f"![{item.title}]({item.name}.png)\n"
-    head, *rows = csv.reader(values.read_text().splitlines())
-    lines = [head, ["---"] * len(head), *([name, f"{float(value):.6g}", units] for name, value, units in rows)]
+    columns = zip(*csv.reader(values.read_text().splitlines()), strict=True)
+    lines = [["name", "value", "units"], ["---"] * 3]
+    for header, value in columns:
+        name, _, units = header.removesuffix("]").partition(" [")
+        lines += [[name, f"{float(value):.6g}", units]] if name != "outcome" else []
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines) + f"\n\n[The table as CSV]({values.name})\n"
 
 
@@ -170,8 +173,10 @@ def entry(item: Item, results: Sequence[Path], problem: str, remarked: bool) -> 
     runs = [f"$ drivetrain run sweeps/{path.name} --out {path.stem}.nc" for path in item.scenes]
     files = " ".join(f"{path.stem}.nc" for path in item.scenes)
     part = "".join(f" {name}={value:.10g}" for name, value in item.part.items())
-    ending = "csv" if results and (results[0].parent / f"{item.name}.csv").exists() else "png"
-    runs.append(f"$ drivetrain plot {files} --out {item.name}.{ending}" + (f" --part{part}" if part else ""))
+    if results and (results[0].parent / f"{item.name}.csv").exists():
+        runs.append(f"$ drivetrain export {files} --csv {item.name}.csv")
+    else:
+        runs.append(f"$ drivetrain plot {files} --out {item.name}.png" + (f" --part{part}" if part else ""))
     yield "\n".join(["```console", *runs, "```\n"])
     yield "; ".join(counts(open_result(path)) for path in results if path.exists()) + ".\n"
 

@@ -34,8 +34,6 @@ OK, WRONG_INPUT, INCOMPLETE, INTERRUPTED = 0, 2, 3, 130
 # Errors of standard output: a reader that has left, a full disk.
 _OUTPUT = (errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EIO)
 _FIGURES = (".png", ".pdf", ".svg")
-# Tables of constants, and their separators.
-_TABLES = {".txt": "", ".csv": ","}
 _PAGES = (".html", ".htm")
 
 
@@ -190,7 +188,7 @@ _COMMANDS: dict[str, tuple[str, tuple[Any, ...]]] = {
     )),
     "plot": ("draw the figure of a result", (
         _file("files", "FILE.nc", "results; overlaid: methods of one analysis, or a chart and its atlas", nargs="+"),
-        _file("--out", "FIGURE", "figure (.png, .pdf, .svg) or table of constants (.txt, .csv)", required=True),
+        _file("--out", "FIGURE", "figure (.png, .pdf, .svg)", required=True),
         _argument("--part", "name=LOW:HIGH", "part of an atlas: ranges, or name=value", **_SEVERAL),
         _argument("--cells", "N", "cells per axis for an atlas (default: 800)", type=int),
         _argument("--units", "rpm,deg", "units of the axes (default: those of the scene)"),
@@ -411,18 +409,13 @@ def export(options: argparse.Namespace) -> int:
 
 
 def plot(options: argparse.Namespace) -> int:
-    """Draw the figure of one result or of several results together, or write a table of constants."""
-    from drivetrain_jax.datasets.figure import plot, table
+    """Draw the figure of one result or of several results together."""
+    from drivetrain_jax.datasets.figure import plot
     from drivetrain_jax.store.checksums import refuse_damaged
 
-    _check_place(options.out, (*_FIGURES, *_TABLES))
-    ending, image = options.out.suffix.lower(), io.BytesIO()
-    part = ranges(options.part, "--part") or None
-    if ending in _TABLES and (len(options.files) > 1 or part or options.cells is not None):
-        raise InputError(f"out = {str(options.out)!r}: a table shows one whole result; expected figures")
+    _check_place(options.out, _FIGURES)
+    image, part = io.BytesIO(), ranges(options.part, "--part") or None
     with _reading(*options.files):
-        if ending in _TABLES:
-            return _write(options.out, table(options.files[0], options.units, _TABLES[ending]).encode())
         try:
             figure = plot(options.files, part=part, cells=options.cells, units=options.units)
         except InputError:
@@ -432,7 +425,7 @@ def plot(options: argparse.Namespace) -> int:
             for file in options.files:
                 refuse_damaged(file, rewritten=True)
             raise
-        figure.savefig(image, format=ending[1:])
+        figure.savefig(image, format=options.out.suffix.lower()[1:])
     return _write(options.out, image.getbuffer())
 
 
@@ -464,8 +457,12 @@ def _check_place(out: Path, endings: tuple[str, ...]) -> None:
         what = "is a folder" if out.is_dir() else "not a regular file"
         raise InputError(f"out = {str(out)!r}: {what}; expected a new file, or one to replace")
     if out.suffix.lower() not in endings:
-        printed = "; a browser prints the page as PDF" if out.suffix.lower() == ".pdf" else ""
-        raise InputError(f"out = {str(out)!r}: expected a name that ends in {', '.join(endings)}{printed}")
+        hints = {
+            ".pdf": "; a browser prints the page as PDF",
+            ".csv": "; a table is written by `drivetrain export --csv`",
+        }
+        hint = hints.get(out.suffix.lower(), "")
+        raise InputError(f"out = {str(out)!r}: expected a name that ends in {', '.join(endings)}{hint}")
 
 
 def _write(out: Path, data: bytes | memoryview) -> int:

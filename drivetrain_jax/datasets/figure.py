@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -88,31 +86,6 @@ def lacks(error: Exception, why: str) -> InputError:
     """The error for a part of a result that lacks what ``error`` names."""
     lost = (re.search(r"'[^']+'", str(error)) or ["a dimension"])[0]
     return InputError(f"result: without {lost}, which {why}; expected a whole result")
-
-
-def table(path: Path, units: str | None, separator: str = "") -> str:
-    """The constants of a single point as text: aligned under title and parameters, or ``name,value,units`` with a separator.
-
-    Raises :class:`InputError` for a result over an axis, and of another analysis.
-    """
-    dataset = _loaded(_dataset(path))
-    if dataset.attrs.get("analysis") != "parameters":
-        raise InputError(f"file = {str(path)!r}: has a figure; expected a name that ends in .png, .pdf, .svg")
-    from drivetrain_jax.view import charts
-    from drivetrain_jax.view.sheet import shown_title
-    from drivetrain_jax.view.style import caption
-
-    dataset = charts.prepare(in_units(dataset, [] if units is None else listed(units)))
-    if charts.sweep_axes(dataset) or not charts.results(dataset):
-        raise charts.wrong_axes(dataset, "none for a table; a figure ends in .png, .pdf, .svg")
-    rows = charts.table_rows(dataset, ".17g" if separator else ".6g")
-    if separator:
-        text = io.StringIO()
-        csv.writer(text, delimiter=separator, lineterminator="\n").writerows([("name", "value", "units"), *rows])
-        return text.getvalue()
-    widths = [max(len(row[k]) for row in rows) for k in (0, 1)]
-    head = [shown_title(dataset), re.sub(r"[$\\{}]|mathrm", "", caption(dataset)), ""]
-    return "\n".join([*head, *(f"{n:<{widths[0]}}  {v:>{widths[1]}}  {u}".rstrip() for n, v, u in rows), ""])
 
 
 def drawn(datasets: list[xr.Dataset], asked: list[str], check: bool = True) -> Figure:

@@ -368,7 +368,7 @@ def _table(dataset: xr.Dataset) -> Figure:
     return sheet.finish(dataset)
 
 
-def table_rows(dataset: xr.Dataset, digits: str = ".6g") -> list[tuple[str, str, str]]:
+def table_rows(dataset: xr.Dataset) -> list[tuple[str, str, str]]:
     """Name, value and unit of every result of a single point, one row for each entry of its own dimension."""
     rows = []
     for name in results(dataset):
@@ -378,7 +378,7 @@ def table_rows(dataset: xr.Dataset, digits: str = ".6g") -> list[tuple[str, str,
             entry = variable[place]
             numbered = zip(variable.dims, place, strict=True)
             labels = [f", {dim} {entry[dim].item() if dim in entry.coords else k}" for dim, k in numbered]
-            value = words[int(entry)].replace("_", " ") if words else f"{entry.item():{digits}}"
+            value = words[int(entry)].replace("_", " ") if words else f"{entry.item():.6g}"
             rows.append((label + "".join(labels), value, "" if units == "1" else units))
     return rows
 

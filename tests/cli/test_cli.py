@@ -325,8 +325,10 @@ def test_wrong_run_is_one_line_and_writes_nothing(cli, folder, case):
             "amplitude = 2: not a parameter; did you mean the option --ampl",
         ),
         (("point", "toy", "toy", "a=1", "sensitivities=true"), "did you mean the option --sensitivities?"),
-        (("plot", "r.nc", "s.nc", "--out", "t.csv"), "out = 't.csv': a table shows one whole result; expected figures"),
-        (("plot", "r.nc", "--part", "a=1", "--out", "t.txt"), "out = 't.txt': a table shows one whole result"),
+        (
+            ("plot", "r.nc", "--out", "t.csv"),
+            "expected a name that ends in .png, .pdf, .svg; a table is written by `drivet",
+        ),
         (("point", "toy", "toy", "a=" + "9" * 5000), "a = inf: expected 0 <= a <= 10"),
         (("plot", "nothing.nc", "--out", "f.png"), "does not exist"),
         (("plot", "scene.toml", "--out", "f.png"), "not a readable"),

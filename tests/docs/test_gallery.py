@@ -68,7 +68,7 @@ def test_constants_of_one_point_are_a_table(folders, monkeypatch):
     assert set(state(out)) == {"a.nc", "a.csv"}
     value = float(gallery.open_result(out / "a.nc")["natural_angular_frequency"])
     page = (out / "index.md").read_text()
-    assert f" | {value:.6g} | rad/s |" in page and "--out a.csv" in page and "a.png" not in page
+    assert f" | {value:.6g} | rad/s |" in page and "--csv a.csv" in page and "a.png" not in page
 
 
 def test_every_scene_has_its_place():

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-
 import numpy as np
 import pytest
 import xarray as xr
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.datasets.figure import table
 from drivetrain_jax.view import plot
 from drivetrain_jax.view.style import caption
 from tests.view.results import texts
@@ -59,17 +56,3 @@ def test_caption_leaves_defaults_out():
 def test_no_constant_at_all_is_an_input_error():
     with pytest.raises(InputError, match=r"^outputs = outcome: nothing to plot; the figure needs a result$"):
         plot(constants("beta")[["outcome"]])
-
-
-def test_constants_without_an_axis_are_a_table_of_text(tmp_path):
-    labelled_file = tmp_path / "r.nc"
-    constants().to_netcdf(labelled_file, engine="h5netcdf")
-    lines = table(labelled_file, "rpm").splitlines()
-    assert lines[0] == "Constants"
-    assert [line.split()[-2:] for line in lines[3:]] == [["91995.3", "rpm"], ["100140", "rpm"], ["200280", "rpm"]]
-    rows = list(csv.reader(table(labelled_file, None, ",").splitlines()))
-    assert rows[0] == ["name", "value", "units"] and float(rows[1][1]) == 9633.726700903984
-    assert rows[3][0] == "frequency of the midshaft, mode 2" and rows[3][2] == "Hz"
-    with pytest.raises(InputError, match=r"axes = beta: expected none for a table"):
-        constants("beta").to_netcdf(labelled_file, engine="h5netcdf")
-        table(labelled_file, None)
