@@ -291,11 +291,10 @@ def columns_scene(system: str, analysis: str, outputs: Sequence[str], columns: C
 _COMPILING: defaultdict[str, Lock] = defaultdict(Lock)
 
 
-def engine_job(scene: Mapping[str, Any], threads: int = 1, spent: np.ndarray | None = None) -> Job:
+def engine_job(scene: Mapping[str, Any], threads: int = 1) -> Job:
     """A function that computes every point of ``scene`` as ``dt.run`` does, with ``threads``; results by name, points first.
 
-    This call compiles the kernels, unless another scene of the process shares them. ``spent`` takes the seconds of each
-    point: those of its chunk, divided evenly.
+    This call compiles the kernels, unless another scene of the process shares them.
     """
     from drivetrain_jax.runs.kernel import kernel_of
     from drivetrain_jax.runs.resolve import resolve
@@ -311,11 +310,7 @@ def engine_job(scene: Mapping[str, Any], threads: int = 1, spent: np.ndarray | N
         kernels = {kind: kernel_of(engine.scene, grid, engine.solvers[kind[0]], kind[1]) for kind in kinds}
 
     def work(chunk: Any) -> Mapping[str, np.ndarray]:
-        columns, begin = grid.columns(chunk.points), time.perf_counter()
-        values = kernels[chunk.solver, chunk.size](columns, grid.numbers, chunk.effort)
-        if spent is not None:
-            spent[chunk.points] = (time.perf_counter() - begin) / chunk.points.size
-        return values
+        return kernels[chunk.solver, chunk.size](grid.columns(chunk.points), grid.numbers, chunk.effort)
 
     def job() -> dict[str, np.ndarray]:
         results: dict[str, np.ndarray] = {}

@@ -104,8 +104,6 @@ def write_page(folder: Path, page: Path) -> None:
     for system, part in rows.groupby("system", sort=False):
         file = load(folder, f"precision_{system}")
         figures.draw_precision(part, file.facts if file else {}, folder / f"precision_{system}.png")
-    if len(rows):
-        figures.draw_ratios(compared(rows), TITLES, folder / "ratios.png")
     page.write_text(text_of(folder, page))
 
 
@@ -121,7 +119,6 @@ def text_of(folder: Path, page: Path) -> str:
         f"Speeds within {LEVEL - 1:.0%} are level. Regions are compared at an error of at most {GOAL:g}, on one core unless "
         "the title names two.",
         answer(pairs) if pairs else not_measured("precision_cardan"),
-        f"![Every comparison of the table]({images}ratios.png)",
         "Written by `python -m benchmarks.page` from the files in `benchmarks/results/`, which have every setting of every "
         "method, and the versions of all packages; `drivetrain bench` measures them again.",
         "## The cardan chart",
