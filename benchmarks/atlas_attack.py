@@ -137,33 +137,23 @@ def relative_error_of_z(atlas: StabilityAtlas, points: np.ndarray) -> np.ndarray
     return np.linalg.norm(monodromy(phi) - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
 
 
-@dataclass(frozen=True)
-class Candidates:
-    """Cells of a grid, or points, with their results as flat arrays."""
+def candidates(atlas: StabilityAtlas, side: int) -> tuple[Callable[[np.ndarray], np.ndarray], Results]:
+    """The points of chosen cells, and the results of all as flat arrays.
 
-    place: Callable[[np.ndarray], np.ndarray]
-    found: Results
-
-    def take(self, chosen: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Points and results of the chosen cells."""
-        return self.place(chosen), {name: value[chosen] for name, value in self.found.items()}
-
-
-def candidates(atlas: StabilityAtlas, side: int) -> Candidates:
-    """``side`` x ``side`` cells over the ranges of the atlas, or fewer random points, each of which takes longer."""
+    There are ``side`` x ``side`` cells over the ranges of the atlas, or fewer random points, each of which takes longer.
+    """
     from tests.oracles.atlas_direct import random_points
 
     if len(atlas.atlas.parameters) > 2:
         points = random_points(atlas, side**2 // _PART, seed=3)
-        return Candidates(lambda chosen: points[chosen], atlas.at(points))
+        return points.__getitem__, atlas.at(points)
     axes = [np.linspace(low, high, side) for low, high in zip(atlas.atlas.lower, atlas.atlas.upper, strict=True)]
-    found = {name: value.reshape(-1) for name, value in atlas.on_grid(axes).items()}
 
     def place(chosen: np.ndarray) -> np.ndarray:
         i, j = np.unravel_index(chosen, (side, side))
         return np.stack([axes[0][i], axes[1][j]], axis=1)
 
-    return Candidates(place, found)
+    return place, {name: value.reshape(-1) for name, value in atlas.on_grid(axes).items()}
 
 
 @dataclass(frozen=True)
@@ -224,12 +214,12 @@ def attack(case: Case, size: Size, atlas: StabilityAtlas, pool: Executor | None 
     row = description(case, atlas) | {
         "z_error": float(relative_error_of_z(atlas, random_points(atlas, size.cells)).max())
     }
-    cells = candidates(atlas, size.side)
-    undecided, total = int((cells.found["verdict"] == UNDECIDED).sum()), cells.found["verdict"].size
-    chosen = (np.random.default_rng(2).integers(0, total, size.cells), *hardest(cells.found, size.cells))
+    place, results = candidates(atlas, size.side)
+    undecided, total = int((results["verdict"] == UNDECIDED).sum()), results["verdict"].size
+    chosen = (np.random.default_rng(2).integers(0, total, size.cells), *hardest(results, size.cells))
     direct, exact = {}, {}
     for kind, index in zip(KINDS, chosen, strict=True):
-        points, found = cells.take(index)
+        points, found = place(index), {name: value[index] for name, value in results.items()}
         radius, _ = direct_radius(atlas, points)
         direct[kind] = against_direct(points, found, radius)
         few = worst(found, radius, size.worst)

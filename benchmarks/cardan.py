@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from benchmarks.measure import Columns, Job, Judged, Method, Study, judged, near, once, outcomes, points_job, take
+from benchmarks.measure import Columns, Job, Judged, Method, Study, judged, near, outcomes, points_job, take
 from tests.oracles.cardan_orbit_reference import geometry, linear_field, nonlinear_field
 from tests.oracles.cardan_precise_reference import spectral_radius as precise_radius
 from tests.oracles.cardan_reference import (
@@ -280,7 +280,7 @@ def _points(region: str) -> np.ndarray:
     return np.stack([columns[name] for name in NAMES], axis=1)
 
 
-@once
+@cache
 def _compiled_gradient(kind: str, rtol: float) -> Callable[..., Any]:
     import diffrax
     import jax
@@ -399,7 +399,7 @@ def forced_error(region: str, rtol: float, results: Mapping[str, np.ndarray]) ->
     return motion_error(region, rtol, state, notice)
 
 
-@once
+@cache
 def _compiled_shooting(linear: bool) -> Callable[..., Any]:
     import diffrax
     import jax

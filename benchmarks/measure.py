@@ -16,16 +16,14 @@ import sys
 import tempfile
 import time
 import warnings
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import cache, partial, wraps
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
-from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -155,7 +153,7 @@ class Study:
 
 def measure(contenders: Sequence[Contender], repeats: int = REPEATS, spent: float = SPENT) -> list[Rung]:
     """One rung per contender: all are compiled and compared first, then timed in turns; times are medians."""
-    prepared = at_once([partial(_prepared, contender) for contender in contenders])
+    prepared = list(map(_prepared, contenders))
     jobs, rungs = {}, []
     for number, (c, (job, compile_s)) in enumerate(zip(contenders, prepared, strict=True)):
         verdict, seconds, ran = _first(c, job)
@@ -221,25 +219,7 @@ def interleaved(jobs: Mapping[Any, Job], runs: Mapping[Any, int]) -> dict[Any, l
     return seconds
 
 
-def at_once(makers: Sequence[Callable[[], Any]]) -> list[Any]:
-    """The results of ``makers``, in threads: they mostly compile, which releases the interpreter lock."""
-    with ThreadPoolExecutor(CORES) as pool:
-        return list(pool.map(lambda make: make(), makers))
-
-
-def once(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``functools.cache`` for several threads: the second of two equal calls waits instead of computing again."""
-    kept, locks = cache(function), defaultdict[Any, Lock](Lock)
-
-    @wraps(function)
-    def locked(*arguments: Any) -> Any:
-        with locks[arguments]:
-            return kept(*arguments)
-
-    return locked
-
-
-@once
+@cache
 def pool() -> ProcessPoolExecutor:
     """One spawned process per core (a fork after jax has started its threads can hang)."""
     return ProcessPoolExecutor(CORES, mp_context=get_context("spawn"))
@@ -287,10 +267,6 @@ def columns_scene(system: str, analysis: str, outputs: Sequence[str], columns: C
     return {"system": system, "analysis": analysis, "outputs": list(outputs), "points": points, **rest}
 
 
-# Locks by kernel: one thread compiles a kernel, and others that need it wait.
-_COMPILING: defaultdict[str, Lock] = defaultdict(Lock)
-
-
 def engine_job(scene: Mapping[str, Any], threads: int = 1) -> Job:
     """A function that computes every point of ``scene`` as ``dt.run`` does, with ``threads``; results by name, points first.
 
@@ -304,10 +280,8 @@ def engine_job(scene: Mapping[str, Any], threads: int = 1) -> Job:
     engine = resolve(load_scene(dict(scene)))
     grid = engine.grid
     chunks = [chunk for block in engine.blocks() for chunk in engine.plan(block)]
-    kinds = sorted({(chunk.solver, chunk.size) for chunk in chunks})
-    shape = {key: sorted(value) if key == "points" else value for key, value in scene.items()}
-    with _COMPILING[repr((shape, [(engine.solvers[index].name, size) for index, size in kinds]))]:
-        kernels = {kind: kernel_of(engine.scene, grid, engine.solvers[kind[0]], kind[1]) for kind in kinds}
+    kinds = {(chunk.solver, chunk.size) for chunk in chunks}
+    kernels = {(index, size): kernel_of(engine.scene, grid, engine.solvers[index], size) for index, size in kinds}
 
     def work(chunk: Any) -> Mapping[str, np.ndarray]:
         return kernels[chunk.solver, chunk.size](grid.columns(chunk.points), grid.numbers, chunk.effort)

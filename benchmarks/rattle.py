@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from benchmarks.measure import Job, Judged, Method, Study, engine_job, judged, once, outcomes, points_job
+from benchmarks.measure import Job, Judged, Method, Study, engine_job, judged, outcomes, points_job
 from drivetrain_jax.systems.rattle import PRESETS, Rattle
 from tests.oracles.rattle_reference import extended, field, scipy_events, scipy_plain
 
@@ -75,7 +75,7 @@ def arrays(values: Mapping[str, float], lanes: int) -> dict[str, np.ndarray]:
     return {name: np.full(lanes, values[name]) for name in TABLE1}
 
 
-@once
+@cache
 def marching(lanes: int) -> Callable[..., Any]:
     """The closed form, compiled for this many lanes: states (2, lanes), flags of finished lanes."""
     import jax
@@ -163,7 +163,7 @@ def integrate(model: Any, state: Any, end: Any, rtol: Any, events: bool) -> tupl
     return there, t >= end
 
 
-@once
+@cache
 def integrating(events: bool) -> Callable[..., Any]:
     """diffrax over 8 lanes, compiled once for all regions and tolerances."""
     import jax

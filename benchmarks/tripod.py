@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from benchmarks.measure import Job, Judged, Method, Study, judged, once, outcomes, points_job
+from benchmarks.measure import Job, Judged, Method, Study, judged, outcomes, points_job
 from tests.oracles.tripod_reference import NINE_DEGREES, Shaft, shaft
 
 HEYOKA = find_spec("heyoka") is not None
@@ -111,7 +111,7 @@ def by_scipy(region: Region, method: str, rtol: float) -> np.ndarray:
     return motion.y[:, -1] if motion.success else np.full(2, np.nan)
 
 
-@once
+@cache
 def _taylor(tolerance: float, extended: bool = False) -> Any:
     """heyoka.py's integrator of a batch, or of one motion in the 80-bit numbers of x86 processors."""
     import heyoka as hy

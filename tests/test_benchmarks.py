@@ -21,12 +21,10 @@ from benchmarks.measure import (
     Method,
     Rung,
     Study,
-    at_once,
     is_silent,
     load,
     measure,
     near,
-    once,
     provenance,
     write_csv,
 )
@@ -194,19 +192,6 @@ def test_fewer_neighbours_are_the_first_of_more():
     assert all(few[name].tolist() == many[name][:2].tolist() for name in "abc")
     assert many["a"][0] == 2.0 and many["c"].tolist() == [1.0] * 8
     assert np.ptp(many["a"]) > 0 and np.abs(many["b"] / 3 - 1).max() <= 0.01
-
-
-def test_two_threads_that_ask_for_the_same_make_it_once():
-    made = []
-
-    @once
-    def make(key):
-        time.sleep(0.02)
-        made.append(key)
-        return object()
-
-    first, second = at_once([lambda: make("a")] * 2)
-    assert first is second and made == ["a"]
 
 
 @pytest.mark.parametrize(
