@@ -354,7 +354,6 @@ def _compute(options: argparse.Namespace, check: Callable[[], None]) -> tuple[An
 
 
 def _overrides(options: argparse.Namespace) -> dict[str, Any]:
-    """Entries of the scene that the command line replaces."""
     from drivetrain_jax.runs.physical import PARTS, read_table
     from drivetrain_jax.runs.toml import read
 

@@ -189,7 +189,6 @@ class DrivetrainAccessor:
 
 
 def _scalars(name: str, entry: dict[str, Any]) -> list[tuple[str, Any, dict[str, str]]]:
-    """A fixed value, or the entries of a list, with attributes."""
     value, labels = entry["value"], {key: entry[key] for key in ("units", "long_name") if key in entry}
     if not isinstance(value, list):
         # JSON has no infinity.

@@ -170,7 +170,6 @@ def _units(system: type[System], shaft: GivenData | None) -> dict[str, Any]:
 
 
 def _model(atlas: Atlas, build: Callable[..., FloquetModel], points: np.ndarray) -> FloquetModel:
-    """The model at points ``(N, d)`` given by their parameters."""
     return build({**atlas.fixed, **dict(zip(atlas.parameters, points.T, strict=True))})
 
 

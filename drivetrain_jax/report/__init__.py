@@ -91,8 +91,6 @@ def _section(path: Path, number: int, asked: list[str], amplitude: Any) -> dict[
     checksums.refuse_damaged(path)
     dataset = open_result(path)
     attrs, analysis, convert = dataset.attrs, dataset.attrs.get("analysis"), partial(_in_units, asked)
-    if analysis is None:
-        raise InputError(f"file = {str(path)!r}: has no attribute 'analysis'; expected a result of drivetrain_jax")
     answers, limit, moved = [], None, None
     if analysis == "atlas":
         answers, chart, compared = _atlas_answers(path, convert, amplitude)

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 PENDING = len(Outcome)
 # Bytes of mapped results kept in memory.
 _RESIDENT = 1 << 26
-_STORAGE = ("h5py",)
 
 
 class ResultBuffer:
@@ -167,7 +166,7 @@ def result_attrs(scene: Scene) -> dict[str, str]:
     # An axis given in physical data takes the role of its parameter.
     dim_of = {axis.name: axis.dim for axis in scene.axes if axis.given}
     roles = {role: dim_of.get(name, name) for role, name in scene.system.roles.items()}
-    installed, created, version = versions((*PACKAGES, *_STORAGE)), now(), drivetrain_jax.__version__
+    installed, created, version = versions((*PACKAGES, "h5py")), now(), drivetrain_jax.__version__
     cited = {"references": scene.system.source} if scene.system.source else {}
     return {
         "Conventions": CONVENTIONS,

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax._quantities import Variable
 from drivetrain_jax.analysis import OUTCOME, get_analysis
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
 from drivetrain_jax.atlas import design, proof
@@ -250,8 +249,14 @@ def query(atlas: StoredAtlas, given: Mapping[str, float], amplitude: Any = None)
     results = {name: values[0] for name, values in atlas.arrays(columns, zipped=True).items()}
     variables = {v.name: v for v in (*atlas.scene.analysis.variables, OUTCOME)}
     proved = "verdict" in results and bool(atlas.proved(point, results["verdict"]))
-    rows = _result_rows(atlas, results, variables)
-    if VERDICTS[int(results.get("verdict", -1))] != "undecided":
+    rows = [
+        f"  {name:<24} {', '.join(map(variables[name].written, np.atleast_1d(value)))}"
+        for name, value in results.items()
+    ]
+    verdict = VERDICTS[int(results["verdict"])] if "verdict" in results else ""
+    if verdict == "undecided":
+        rows.append(f"  {'':<24} {get_analysis('floquet').advice(atlas.request)}")
+    elif verdict:
         rows.append(f"  {'proof':<24} the verdict {'is proved' if proved else 'holds by estimate, not by proof'}")
     slopes = radius_gradient(atlas.scene.system, {**atlas.fixed, **point})
     effects = radius_sensitivities(asked, slopes)
@@ -303,17 +308,6 @@ def _point_sentence(
         change, crossing = min(along, key=lambda x: abs(x[1].value - x[0].value))
         words.append(f"the nearest change of stability lies {_side(asked, change.parameter, change.value, crossing)}")
     return f"{'; '.join(words)}."
-
-
-def _result_rows(atlas: StoredAtlas, results: Mapping[str, Any], variables: Mapping[str, Variable]) -> list[str]:
-    """The results at one point as text, with what may decide an undecided verdict."""
-    rows = [
-        f"  {name:<24} {', '.join(map(variables[name].written, np.atleast_1d(value)))}"
-        for name, value in results.items()
-    ]
-    if int(results.get("verdict", 0)) == VERDICTS.index("undecided"):
-        rows.append(f"  {'':<24} {get_analysis('floquet').advice(atlas.request)}")
-    return rows
 
 
 def least_damping(
@@ -487,12 +481,10 @@ def _and(words: Sequence[str]) -> str:
 
 
 def _but_undecided(ranges: Sequence[Range]) -> str:
-    """The number of undecided ``ranges``, as the end of a sentence."""
     return f"; {len(ranges)} range{'s are' if len(ranges) > 1 else ' is'} undecided" if ranges else ""
 
 
 def _undecided(asked: AtlasQuery, name: str, ranges: Iterable[Range]) -> list[str]:
-    """Undecided ranges as text, with what to do."""
     lines = [f"  undecided: {asked.span(name, ends)}" for ends in ranges]
     remedy = (
         "  undecided ranges: `drivetrain point` solves a value there directly; a smaller rtol of the atlas narrows them"

@@ -216,7 +216,6 @@ def _missing(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any]) -> list
 
 
 def _meshed(axes: Mapping[str, np.ndarray], fixed: Mapping[str, float]) -> dict[str, Any]:
-    """The parameters of all points of a grid."""
     return {**fixed, **dict(zip(axes, np.meshgrid(*axes.values(), indexing="ij"), strict=True))}
 
 

@@ -97,7 +97,6 @@ def sweep(
 def _scene_table(
     name: str, system: System, over: Mapping[str, Any], outputs: Sequence[str] | None, options: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The scene of an analysis of an installed system."""
     conversions = system.physical.conversions if system.physical else ()
     varied = {*over, *(rule.parameter for rule in conversions if rule.needs[0] in over)}
     # An empty list stands for a default of none.
@@ -224,7 +223,6 @@ def _with_outcome(results: Mapping[str, Array], code: Array | None) -> dict[str,
 
 
 def _named(result: Any, name: str) -> dict[str, Array]:
-    """The arrays of a result by name."""
     if isinstance(result, analyses.Result):
         result = result.variables
     named, arrays = result if isinstance(result, Mapping) else {name: result}, {}
@@ -244,7 +242,6 @@ def _named(result: Any, name: str) -> dict[str, Array]:
 
 
 def _check_concrete(*values: Any) -> None:
-    """Check that there are numbers for a file and a dataset."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values)):
         raise InputError(
             "sweep: does not work under jax.jit, jax.grad or jax.vmap; expected numbers outside of them, "

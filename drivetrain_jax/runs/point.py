@@ -86,8 +86,6 @@ class PointResult(NamedResults):
 
     @property
     def _reply(self) -> Reply:
-        """The answer with its data."""
-
         def described(values: Mapping[str, Any], units: Mapping[str, str]) -> dict[str, dict[str, Any]]:
             return {name: {"value": value, "units": units[name]} for name, value in values.items()}
 
@@ -173,7 +171,6 @@ class PointResult(NamedResults):
         return [f"  {_with_units(name, variable.units)}", *aligned([head, *cells])]
 
     def _table(self, dim: str, names: Sequence[str]) -> list[str]:
-        """Results with one dimension as columns of a table."""
         columns = [[dim, *map(str, self.labels[dim])]]
         for name in names:
             variable = self.variables[name]
@@ -263,19 +260,16 @@ def _with_sensitivities(result: PointResult, request: Request, scene: Scene, giv
     """The ``result`` with the sensitivities of the requested results, which its other values served."""
     effects, known = [], described(scene.system)
     if result.outcome.has_value:
-        data = {n: _in_units(x, units, known[n].units) for n, (x, units) in result.physical.items()}
+        data = {
+            n: x if isinstance(x, str) or units == known[n].units else x * _units.factor(units, known[n].units)
+            for n, (x, units) in result.physical.items()
+        }
         asked = replace(scene, request=request)
         effects = point_sensitivities(asked, given, data, result.parameters, result.values)
     shown = differentiable(scene.analysis, request.outputs)
     lines = effect_lines(effects, shown, result.labels)
     values = {name: x for name, x in result.values.items() if name in request.outputs}
     return replace(result, values=values, sensitivities=effects, _effects=lines)
-
-
-def _in_units(value: Any, units: str, wanted: str) -> Any:
-    if units == wanted or isinstance(value, str):
-        return value
-    return value * _units.factor(units, wanted)
 
 
 def _varied(system: str, analysis: str, given: Mapping[str, Any]) -> str | None:
@@ -397,7 +391,7 @@ def _result(job: Job) -> PointResult:
         advice=scene.analysis.advice(scene.request),
         growth=grows,
         orders=orders,
-        sentence=sentence or (_about(orders, values, ordered) if orders else ""),
+        sentence=sentence or (orders.sentence(values, ordered.get("speed", 0.0)) if orders else ""),
     )
 
 
@@ -431,7 +425,7 @@ class OrderCrossings:
         how = ", with the gyroscopic effect" if self.turning else ""
         return [f"  speed of the {self.orders.shaft} at which an order meets the mode{how}", *aligned([head, *modes])]
 
-    def whirl_sentence(self, values: Mapping[str, Any], speed: float) -> str:
+    def _whirl_sentence(self, values: Mapping[str, Any], speed: float) -> str:
         """Frequencies of whirl at the ``speed`` [rad/s] of the shaft, by their sense, and critical speeds."""
         codes, turns = values.get("whirl_direction"), values["whirl_frequency"] / RPM
         senses = {} if codes is None else {"backward at": codes == 0, "forward at": codes == 2, "planar at": codes == 1}
@@ -440,8 +434,11 @@ class OrderCrossings:
         whirl = f"At {speed / RPM:.6g} rpm the shaft whirls {', '.join(said) or f'at {_first(turns)}'}"
         return f"{whirl}; critical speeds {'; '.join(critical)}." if critical else f"{whirl}."
 
-    def sentence(self, values: Mapping[str, Any]) -> str:
-        """The speeds within the operating range, or the first ones, and the modes of ``values`` too near to that range."""
+    def sentence(self, values: Mapping[str, Any], speed: float) -> str:
+        """Whirl at this ``speed``; or the speeds within the operating range and the modes of ``values`` too near to it, or
+        the first speeds."""
+        if "whirl_frequency" in values:
+            return self._whirl_sentence(values, speed)
         if not self.operating:
             (name, column), *_ = self.columns.items()
             met = [f"mode {k + 1} at {column[k]:.6g} rpm" for k in np.flatnonzero(np.isfinite(column))]
@@ -454,13 +451,6 @@ class OrderCrossings:
             modes = f"mode{'s' * (len(near) > 1)} {', '.join(map(str, near))}"
             said += [f"{modes} lack{'s' * (len(near) == 1)} the required separation margin"] if len(near) else []
         return f"{'; '.join(said)}."
-
-
-def _about(orders: OrderCrossings, values: Mapping[str, Any], parameters: Mapping[str, Any]) -> str:
-    """The sentence about whirl at the speed of the ``parameters``, or about the modes."""
-    if "whirl_frequency" in values:
-        return orders.whirl_sentence(values, parameters.get("speed", 0.0))
-    return orders.sentence(values)
 
 
 def order_crossings(scene: Scene, parameters: Mapping[str, Any], values: Mapping[str, Any]) -> OrderCrossings | None:
@@ -492,5 +482,4 @@ def _turning_speeds(scene: Scene, parameters: Mapping[str, Any], orders: Orders)
 
 
 def _first(speeds: np.ndarray) -> str:
-    """The first speeds [rpm] as text."""
     return f"{', '.join(f'{x:.6g}' for x in speeds[np.isfinite(speeds)][:_FEW])} rpm"

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 
 from drivetrain_jax import _units
@@ -27,7 +28,7 @@ from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
 from drivetrain_jax.runs.physical import GivenData, described
 from drivetrain_jax.runs.scene import Scene
 from drivetrain_jax.systems import System, get_system
-from drivetrain_jax.view.style import parameters, scene_key, units_of
+from drivetrain_jax.view.style import parameters, runs, scene_key, units_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -58,7 +59,9 @@ class Reply:
 
     def to_json(self) -> str:
         """``answer`` and ``data`` as one JSON object; numbers that are not finite become null."""
-        return json.dumps(plain({"answer": self.answer, **self.data} if self.answer else self.data), allow_nan=False)
+        content = {"answer": self.answer, **self.data} if self.answer else self.data
+        # msgspec writes null for numbers that are not finite, json only ASCII.
+        return json.dumps(msgspec.json.decode(msgspec.json.encode(content, enc_hook=_builtin)))
 
     def sentences(self) -> list[str]:
         """The answer, and the lines below the heading as sentences, details indented."""
@@ -67,19 +70,13 @@ class Reply:
         return [self.answer, *lines] if self.answer else lines
 
 
-def plain(value: Any) -> Any:
-    """``value`` in the types of JSON; complex numbers as ``real`` and ``imag``, numbers that are not finite as None."""
+def _builtin(value: Any) -> Any:
+    """A mapping, an array or a number of NumPy in the types of JSON; complex numbers as ``real`` and ``imag``."""
     if isinstance(value, Mapping):
-        return {name: plain(entry) for name, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(entry) for entry in value]
-    if value is None or isinstance(value, (str, bool)):
-        return value
+        return dict(value)
     if np.iscomplexobj(value):
-        return {"real": plain(np.real(value)), "imag": plain(np.imag(value))}
-    if np.ndim(value):
-        return [plain(entry) for entry in value]
-    return np.asarray(value).item() if np.isfinite(value) else None
+        return {"real": np.real(value), "imag": np.imag(value)}
+    return np.asarray(value).tolist()
 
 
 def growth_at(asked: AtlasQuery, results: Mapping[str, Any]) -> dict[str, float]:
@@ -424,7 +421,7 @@ class Limit:
         x, y = _sampled(amplitude, low, high, likely, self.value, _LIMIT_ROUNDS)
         size = np.max(y, axis=1)
         k = int(np.argmax(size))
-        return Along(self, float(size[k]), float(x[k]), self.names[int(np.argmax(y[k]))], _runs(x, size <= self.value))
+        return Along(self, float(size[k]), float(x[k]), self.names[int(np.argmax(y[k]))], runs(x, size <= self.value))
 
 
 def _sampled(
@@ -444,12 +441,6 @@ def _sampled(
         inside = np.max(y, axis=1) <= limit
         x, y = _refined(function, x, y, [(x[k], x[k + 1]) for k in np.flatnonzero(inside[1:] != inside[:-1])])
     return x, y
-
-
-def _runs(x: np.ndarray, holds: np.ndarray) -> tuple[tuple[float, float], ...]:
-    """First and last sample of each run of samples ``x`` that ``holds``."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], holds.astype(np.int8), [0]))))
-    return tuple((float(x[a]), float(x[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True))
 
 
 def with_unstable_ranges(dataset: xr.Dataset) -> tuple[xr.Dataset, float]:
@@ -477,7 +468,7 @@ def with_unstable_ranges(dataset: xr.Dataset) -> tuple[xr.Dataset, float]:
     predicted, labels = (known.values(fixed), known.labels) if known and foretold else (np.empty(0), ())
     likely = np.concatenate([axis.values, predicted[np.isfinite(predicted)]])
     x, y = _sampled(size, float(axis.min()), float(axis.max()), likely, 1.0, _VERDICT_ROUNDS)
-    ends = np.reshape(_runs(x, y[:, 0] > 1), (-1, 2))
+    ends = np.reshape(runs(x, y[:, 0] > 1), (-1, 2))
     names = []
     for low, high in ends:
         apart = np.nan_to_num(np.abs(predicted - (low + high) / 2), nan=np.inf)

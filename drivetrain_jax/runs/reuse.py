@@ -253,7 +253,6 @@ def differences_of(scene: Scene, stored: Mapping[str, Any], job: Job, *, points:
 
 
 def _entries(scene: Scene, points: bool) -> dict[str, Any]:
-    """The entries of a scene by dotted name."""
     content, where = scene_content(scene), "points" if scene.zipped else "axes"
     entries = {key: content[key] for key in ("system", "analysis", "method")}
     entries |= {f"options.{name}": value for name, value in sorted(content["options"].items())}

@@ -223,7 +223,6 @@ def fixed_of(scene: Scene, ranges: Mapping[str, tuple[float, float]]) -> dict[st
 def _solves(
     scene: Scene, fixed: Mapping, names: tuple[str, ...], points: np.ndarray, method: str, options: Mapping
 ) -> Nodes:
-    """The direct solves of some points."""
     request = Request(SOLVES.default_outputs, method, dict(options))
     nodes = Nodes(scene.system, SOLVES, request, (), True, fixed)
     # Fixed numbers as columns: jax traces a march twice if some of its parameters are the same for all lanes.

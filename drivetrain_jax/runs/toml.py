@@ -79,13 +79,17 @@ def plain(value: Any) -> Any:
 
 
 def _text(path: Path) -> str:
+    """The text of the scene at ``path``, or of the packaged one of this name."""
+    names = sorted(packaged.stem for packaged in FOLDER.glob("*.toml"))
+    file = FOLDER / f"{path}.toml" if str(path) in names and not path.is_file() else path
     try:
         # Editors on Windows put a byte order mark first.
-        return scene_file(path).read_text("utf-8-sig")
+        return file.read_text("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"scene = {str(path)!r}: not a text file in UTF-8") from None
     except OSError as error:
-        raise InputError(f"scene = {str(path)!r}: {error.strerror}; {remedy(path)}") from None
+        allowed = f"give the path of a scene file, or a name of `drivetrain list`{did_you_mean(str(path), names)}"
+        raise InputError(f"scene = {str(path)!r}: {error.strerror}; {allowed}") from None
 
 
 def _replace(tree: dict[str, Any], key: str, value: Any) -> None:
@@ -167,18 +171,3 @@ def _value(value: Any) -> str:
 
 # In a checkout this is a link to the folder at the top; in a wheel it contains the files.
 FOLDER = Path(drivetrain_jax.__file__).parent / "sweeps"
-
-
-def names() -> list[str]:
-    """Names of these scenes, sorted."""
-    return sorted(path.stem for path in FOLDER.glob("*.toml"))
-
-
-def scene_file(source: Path) -> Path:
-    """The packaged file if ``source`` is the name of a scene and not of an existing file, else ``source``."""
-    return FOLDER / f"{source}.toml" if str(source) in names() and not source.is_file() else source
-
-
-def remedy(source: Path) -> str:
-    """The remedy for a ``source`` that cannot be read."""
-    return f"give the path of a scene file, or a name of `drivetrain list`{did_you_mean(str(source), names())}"

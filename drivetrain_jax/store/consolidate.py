@@ -352,8 +352,6 @@ def open_result(path: Path) -> xr.Dataset:
     import xarray as xr
 
     path = path.expanduser()
-    if not path.exists():
-        raise InputError(f"file = {str(path)!r}: does not exist; give a result written by `drivetrain run`")
     attributes(path)
     try:
         with xr.open_dataset(path, engine="h5netcdf", phony_dims="sort") as dataset:

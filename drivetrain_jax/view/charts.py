@@ -341,7 +341,6 @@ def _flagged(dataset: xr.Dataset) -> str:
 
 
 def _plane(dataset: xr.Dataset) -> Figure:
-    """Floquet multipliers and the unit circle."""
     multipliers = dataset["floquet_multiplier"]
     require_values(multipliers)
     sheet, angle = Sheet(height=4.0), np.linspace(0, 2 * np.pi, 361)
@@ -355,7 +354,6 @@ def _plane(dataset: xr.Dataset) -> Figure:
 
 
 def _table(dataset: xr.Dataset) -> Figure:
-    """The values of a single point."""
     rows = table_rows(dataset)
     sheet = Sheet(height=_ROW * len(rows))
     axes = sheet.axes[0, 0]

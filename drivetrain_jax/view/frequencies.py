@@ -199,7 +199,6 @@ def _colours(count: int) -> np.ndarray:
 
 
 def _gears(dataset: xr.Dataset) -> Figure:
-    """One gear for every frequency."""
     charts.require(dataset, "mode_shape")
     name, units = charts.role(dataset, "planets"), units_of(dataset["natural_frequency"])
     angles, types, colours = parameters(dataset).get(name), _types(dataset), type_colours(dataset)
@@ -441,7 +440,6 @@ def _shaft(dataset: xr.Dataset) -> tuple[list[float], list[float], dict[str, lis
 
 
 def _draw_shaft(sheet: Sheet, axes: Axes, edges: list[float], thickness: list[float], points: dict[str, Any]) -> None:
-    """Draw the segments as grey boxes about the axis, and the symbols of the points."""
     for left, right, height in zip(edges, edges[1:], thickness, strict=False):
         box = (left, -height / 2), right - left, height
         axes.add_patch(Rectangle(*box, facecolor=FRAME_GREY, alpha=0.2, edgecolor="none"))
@@ -497,7 +495,6 @@ def whirl(dataset: xr.Dataset) -> Figure | None:
 
 
 def _crossings(x: np.ndarray, curve: np.ndarray, line: np.ndarray) -> list[tuple[float, float]]:
-    """Points at which ``curve`` crosses ``line``, by interpolation."""
     gap = curve - line
     places = np.flatnonzero((gap[:-1] >= 0) != (gap[1:] >= 0))
     shares = [(k, gap[k] / (gap[k] - gap[k + 1])) for k in places if np.isfinite(gap[k : k + 2]).all()]

@@ -191,8 +191,13 @@ def coordinate_text(coordinate: xr.DataArray) -> str:
 
 def ranges_text(axis: xr.DataArray, holds: np.ndarray) -> str:
     """The runs of sampled values of ``axis`` at which ``holds`` is true: ``speed = 1425, 2275 to 2290 rpm``."""
+    return runs_text(axis, runs(axis.values, holds))
+
+
+def runs(values: np.ndarray, holds: np.ndarray) -> tuple[tuple[float, float], ...]:
+    """First and last of the ``values`` in each run that ``holds``."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], holds.astype(np.int8), [0]))))
-    return runs_text(axis, [(axis.values[a], axis.values[b - 1]) for a, b in zip(edges[::2], edges[1::2], strict=True)])
+    return tuple((float(values[a]), float(values[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True))
 
 
 def runs_text(axis: xr.DataArray, runs: Sequence[Any] | np.ndarray, names: Sequence[str] | np.ndarray = ()) -> str:
