@@ -577,7 +577,8 @@ def _sentence(codes: xr.DataArray, axis: xr.DataArray, exact: str) -> str:
     shown = [k for k, n in enumerate(names) if counts[k] and k != most and not (words and n in ("stable", "unstable"))]
     words += [f"{names[k]} at {ranges_text(axis, codes.values == k)}" for k in shown]
     text = "; ".join(words) or (f"{names[most]} throughout" if counts[most] == codes.size else "")
-    return textwrap.fill(f"{text[:1].upper()}{text[1:]}." if text else "", LETTERS)
+    # The sentence begins at the axes, not at the edge of the figure.
+    return textwrap.fill(f"{text[:1].upper()}{text[1:]}." if text else "", LETTERS - 15)
 
 
 def fit_panels(sheet: Sheet, dataset: xr.Dataset, along: str) -> None:
