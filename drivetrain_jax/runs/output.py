@@ -369,4 +369,5 @@ def missed(out: Path, count: int, total: int) -> str:
         if _VERDICT in file:
             undecided = int((file[_VERDICT][()].reshape(-1)[places] == _UNDECIDED).sum())
             text += f"; {undecided:,} of them undecided" if undecided else "; the verdicts are decided"
+        text += "; direct solves (method = 'direct') have closer bounds" if "atlas_solves" in file.attrs else ""
     return f"{text}; {mark}"

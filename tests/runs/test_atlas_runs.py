@@ -22,6 +22,7 @@ from drivetrain_jax.runs import atlas_answers, atlas_chart, through_atlas
 from drivetrain_jax.runs import resolve as resolve_module
 from drivetrain_jax.runs.atlas_chart import chart
 from drivetrain_jax.runs.job import Job
+from drivetrain_jax.runs.output import missed
 from drivetrain_jax.runs.resolve import choose_atlas
 from drivetrain_jax.runs.run import Incomplete, Interrupted, run_to_file
 from drivetrain_jax.runs.scene import load_scene
@@ -629,3 +630,13 @@ def test_the_kernel_of_single_cells_compiles_during_the_solves(monkeypatch):
     monkeypatch.setattr(stability, "_FEW", 0)
     dt.run(floquet("atlas"))
     assert len(set(made)) == 1
+
+
+def test_the_remark_about_wide_bounds_of_an_atlas_names_the_remedy(tmp_path):
+    with h5py.File(tmp_path / "chart.nc", "w") as file:
+        file.attrs.update({"options": '{"rtol": 1e-9}', "atlas_solves": 64})
+        file["outcome"] = np.array([1, 0], np.int8)
+    assert missed(tmp_path / "chart.nc", 1, 2) == (
+        "1 of 2 values misses the tolerance 1e-09; direct solves (method = 'direct') have closer bounds; "
+        "outcome = 1 marks it"
+    )
