@@ -625,16 +625,19 @@ def draw_lines(
             linear = 10.0 ** np.floor(np.log10(max(np.quantile(distance, 0.1), _ROUNDING))) if distance.size else 1.0
             axes.set_yscale("symlog", linthresh=linear)
         inner = next((str(dim) for dim in values.dims if dim != along), None)
+        words = " ".join(word for word in titles[number] if word not in common) if len(keys) > 1 else ""
+        if inner and words and named:
+            sheet.add(Line2D([], [], color=FRAME_GREY, linestyle=_DASHES[number], label=words))
         for k in range(values.sizes[inner] if inner else 1):
             line = values.isel({inner: k}) if inner else values
-            names = [entry_name(inner, line[inner].item() if inner in line.coords else k)] if inner else []
-            names += [" ".join(word for word in titles[number] if word not in common)] if len(keys) > 1 else []
+            name_of_line = entry_name(inner, line[inner].item() if inner in line.coords else k) if inner else words
             colour = colours[(k if inner else number) % len(colours)]
-            look: dict[str, Any] = {"color": colour, "label": ", ".join(names)}
+            look: dict[str, Any] = {"color": colour, "label": name_of_line}
             look |= {"linestyle": _DASHES[number if inner else 0]} | style
             look |= {"linewidth": 0.9 + 0.6 * (values.sizes[inner] - 1 - k)} if wider and inner else {}
             drawn = axes.plot(x, line, **look)
-            sheet.add(*(drawn if names and named else ()))
+            # The dashes of further variables have an entry of their own.
+            sheet.add(*(drawn if name_of_line and named and not (inner and number) else ()))
             if bound in dataset:
                 ends = [_scaled(dataset, key, known + side * factor * dataset[bound])[0] for side in (-1, 1)]
                 low, high = (end.isel({inner: k}) if inner else end for end in ends)

@@ -159,3 +159,21 @@ def test_numbers_along_axes_are_plain_text():
     assert not [label for label in labels if "$" in label] and any(label.startswith("\u221210") for label in labels)
     formulas = [r"$\mathdefault{-10^{-3}}$", r"$\mathdefault{2\times10^{4}}$", r"$\beta$", "0.5"]
     assert sheet.plain_labels(list, formulas) == ["\u221210\u207b\u00b3", "2\u00d710\u2074", r"$\beta$", "0.5"]
+
+
+def test_lines_of_two_variables_share_colours_and_the_entries_of_the_legend():
+    shape, about = ("speed", "shaft"), {"units": "N m"}
+    known = {"long_name": "largest torque, linear system"} | about
+    dataset = xr.Dataset(
+        {
+            "torque": (shape, [[1.0, 2.0], [3.0, 4.0]], known),
+            "orbit_torque": (shape, [[1.5, 2.5], [3.5, 4.5]], known | {"long_name": "largest torque, nonlinear orbit"}),
+            "outcome": ("speed", [0, 0]),
+        },
+        {"speed": [1.0, 2.0], "shaft": ["1 front", "2 rear"]},
+        {"analysis": "forced"},
+    )
+    figure = charts.chart(dataset, [["torque", "orbit_torque"]])
+    assert results.legend(figure) == ["linear system", "shaft 1 front", "shaft 2 rear", "nonlinear orbit"]
+    styles = [(line.get_color(), line.get_linestyle()) for line in panels(figure)[0].get_lines()]
+    assert [styles[0][0], styles[1][0]] == [styles[2][0], styles[3][0]] and styles[0][1] != styles[2][1]
