@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
 from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range, orders_of
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
+from drivetrain_jax.runs.axes import entry_of
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.physical import PARTS, described, read_table
 from drivetrain_jax.runs.reply import (
@@ -213,8 +214,9 @@ def point(
         sensitivities: adds the effect of one percent of each value on the results, by the given physical data or parameters.
         data: a table of parameters (``.csv``, ``.xlsx``, ``.toml``), a column each with its unit (``length [mm]``).
         given: parameters of the system (or its physical data), and options of the analysis (``method``, ``rtol``, ...);
-            they override ``data``. Of ``floquet`` one may be a range, ``speed=("1500 rpm", "6000 rpm")``: the answer begins
-            with the unstable ranges in it, and the point is the one with the largest spectral radius.
+            they override ``data``, also one entry of a list (``c[3]``). Of ``floquet`` one may be a range,
+            ``speed=("1500 rpm", "6000 rpm")``: the answer begins with the unstable ranges in it, and the point is the one
+            with the largest spectral radius.
 
     Raises: :class:`InputError` with one line that names the field, the value and what is allowed; :class:`ChunkError` if
     the computation fails.
@@ -226,6 +228,7 @@ def point(
     """
     if data is not None:
         given = read_table(Path(data)) | given
+    given = _with_entries(given)
     if (name := _varied(system, analysis, given)) is not None:
         asked = {"outputs": outputs, "amplitude": amplitude, "sensitivities": sensitivities}
         return _least_stable(system, name, given, asked)
@@ -270,6 +273,20 @@ def _with_sensitivities(result: PointResult, request: Request, scene: Scene, giv
     lines = effect_lines(effects, shown, result.labels)
     values = {name: x for name, x in result.values.items() if name in request.outputs}
     return replace(result, values=values, sensitivities=effects, _effects=lines)
+
+
+def _with_entries(given: Mapping[str, Any]) -> dict[str, Any]:
+    """``given`` with its single entries, such as ``c[3]``, in their lists."""
+    placed = {name: value for name, value in given.items() if entry_of(name)[1] is None}
+    for name in given.keys() - placed.keys():
+        parameter, position = entry_of(name)
+        entries = list(placed[parameter]) if np.ndim(placed.get(parameter)) else []
+        if not 0 <= cast(int, position) < len(entries):
+            allowed = f"an entry of the list {parameter}, which has {len(entries)}"
+            raise InputError(f"{name} = {shown(given[name])}: expected {allowed}")
+        entries[position] = given[name]
+        placed[parameter] = entries
+    return placed
 
 
 def _varied(system: str, analysis: str, given: Mapping[str, Any]) -> str | None:

@@ -187,3 +187,14 @@ def test_a_matrix_is_printed_with_its_rows_and_columns():
     assert [float(cell) for cell in lines[-1].split()] == pytest.approx(
         [shape.labels["x"][-1], *shape.mode_shape[:, -1]]
     )
+
+
+def test_one_entry_of_a_list_is_given_alone():
+    lists = {"beta": [0.1, 0.2], "k": np.array([1.0, 2.0])}
+    found = dt.point("driveline", "phasing", **lists, **{"beta[1]": "20 deg", "k[0]": 3.0})
+    assert found.parameters["k"] == (3.0, 2.0)
+    assert found.parameters["beta"] == pytest.approx((0.1, np.radians(20)), rel=1e-15)
+    for name, given, count in (("beta[2]", lists, 2), ("beta[0]", {}, 0), ("speed[0]", {"speed": 3.0}, 0)):
+        parameter = name.partition("[")[0]
+        with pytest.raises(dt.InputError, match=f"expected an entry of the list {parameter}, which has {count}$"):
+            dt.point("driveline", "phasing", **given, **{name: 0.3})
