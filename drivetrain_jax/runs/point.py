@@ -279,9 +279,9 @@ def _with_entries(given: Mapping[str, Any]) -> dict[str, Any]:
     """``given`` with its single entries, such as ``c[3]``, in their lists."""
     placed = {name: value for name, value in given.items() if entry_of(name)[1] is None}
     for name in given.keys() - placed.keys():
-        parameter, position = entry_of(name)
-        entries = list(placed[parameter]) if np.ndim(placed.get(parameter)) else []
-        if not 0 <= cast(int, position) < len(entries):
+        parameter, position = cast(tuple[str, int], entry_of(name))
+        entries = list(placed[parameter]) if np.ndim(placed.get(parameter, 0)) else []
+        if position >= len(entries):
             allowed = f"an entry of the list {parameter}, which has {len(entries)}"
             raise InputError(f"{name} = {shown(given[name])}: expected {allowed}")
         entries[position] = given[name]

@@ -627,7 +627,8 @@ def draw_lines(
         inner = next((str(dim) for dim in values.dims if dim != along), None)
         words = " ".join(word for word in titles[number] if word not in common) if len(keys) > 1 else ""
         if inner and words and named:
-            sheet.add(Line2D([], [], color=FRAME_GREY, linestyle=_DASHES[number], label=words))
+            dashes: Any = _DASHES[number]
+            sheet.add(Line2D([], [], color=FRAME_GREY, linestyle=dashes, label=words))
         for k in range(values.sizes[inner] if inner else 1):
             line = values.isel({inner: k}) if inner else values
             name_of_line = entry_name(inner, line[inner].item() if inner in line.coords else k) if inner else words
