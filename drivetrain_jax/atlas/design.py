@@ -258,7 +258,8 @@ def speed_windows(
             continue
         values = np.linspace(low, high, DENSE)
         rho = criteria.spectral_radius(part.to_coordinates(values[:, None]))
-        k = int(np.argmax(rho))
+        # Both ends may be equal within their errors: the lower one, on every processor.
+        k = int(np.argmax(np.round(rho, 9)))
         check = direct and check_window((low, high), interval, line, criteria, direct)
         windows.append(Window(interval, (low, high), float(rho[k]), float(values[k]), check))
     return Windows(tuple(windows), tuple(i for i in line.intervals if not i.stable), line.undecided)
