@@ -102,6 +102,26 @@ def test_error_bound_holds_on_50000_points():
     assert_bound_holds(direct(points), direct(points, rtol=1e-13))
 
 
+def test_a_tolerance_below_rounding_does_not_add_rounding(direct):
+    """A straight shaft has constant coefficients; 500 times the panels made its error 20 times larger."""
+    speeds = 1 / np.linspace(0.5, 10.0, 64)
+    found = direct(
+        {
+            **{k: np.full(64, v) for k, v in BASE.items()},
+            "beta": np.zeros(64),
+            "mu": np.full(64, 20.0),
+            "Omega": speeds,
+        },
+        rtol=1e-14,
+    )
+    exact = []
+    for speed in speeds:
+        system = CARDAN.models["floquet"].build({**BASE, "mu": 20.0, "beta": 0.0, "Omega": speed}).natural
+        exact.append(np.exp(np.linalg.eigvals(np.asarray(system.matrix(0.0))).real.max() * float(system.span)))
+    error = np.abs(found["spectral_radius"] - exact)
+    assert error.max() < 5e-13 and (error <= found["spectral_radius_error"]).all()
+
+
 CROSSING = {
     "beta": np.array([1.4286756246861043, 0.9151340127635716, 1.2499655001770509]),
     "Omega": np.array([0.051491953585090705, 0.021584104489659632, 0.029022801274611213]),

@@ -75,12 +75,13 @@ class Monodromy(NamedTuple):
     met: Array
     residual: Array
     change: Array | None = None
+    truncation: Array | None = None
 
 
 def unknown(n: int) -> Monodromy:
     """The matrix of one point before any solution."""
     zero, none = jnp.zeros(()), jnp.zeros((n, n))
-    return Monodromy(none, zero, PolynomialError(jnp.full(n, jnp.inf), zero), jnp.array(False), zero, none)
+    return Monodromy(none, zero, PolynomialError(jnp.full(n, jnp.inf), zero), jnp.array(False), zero, none, zero)
 
 
 def assemble(ends: Array | None, phi: Array) -> Array:
@@ -184,4 +185,4 @@ def compare(
     # The propagator itself keeps the units of its states.
     matrix, change = plain if ends is None else (z_fine, apart)
     error = PolynomialError(jnp.stack(errors), centre)
-    return Monodromy(matrix, log_scale, error, met, residual, (4 / (gain - 1)) * change)
+    return Monodromy(matrix, log_scale, error, met, residual, (4 / (gain - 1)) * change, truncation)

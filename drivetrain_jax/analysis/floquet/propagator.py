@@ -146,6 +146,8 @@ LANES = 32
 _SMALL, _FEW, _LONG = 6, 8, 12
 # Most doublings of the predicted number of panels, and most panels.
 _MAX_REFINEMENTS, MAX_PANELS = 6, 2**19
+# Relative truncation below which panels are short enough to show the order of the scheme.
+_SMALL_TRUNCATION = 1e-9
 # Gauss schemes of s stages turn a decay by exp(-D), if it is fast, into a decay by exp(-2 s (s + 1) n^2/D) in n panels.
 _UNDAMPED = 2.0 * STAGES * (STAGES + 1)
 # Angle of an oscillation in a panel beyond which two numbers of panels may agree by accident.
@@ -356,12 +358,12 @@ def _agreeing(
         return propagator._replace(squared=squared)
 
     def unfinished(state: tuple) -> Array:
-        number, count, propagator, z = state
-        going = ~z.met & (jnp.isfinite(propagator.matrix[0, 0]) | (number < 4))
+        number, count, propagator, z, stalled = state
+        going = ~z.met & ~stalled & (jnp.isfinite(propagator.matrix[0, 0]) | (number < 4))
         return (number < 2) | ((number < 2 + _MAX_REFINEMENTS) & (count <= MAX_PANELS) & any_lane(going))
 
     def refine(state: tuple) -> tuple:
-        number, count, coarse, _ = state
+        number, count, coarse, before, _ = state
         recorded = number != 1
         fine = run(count, recorded)
         coarse = coarse.in_units_of(fine.log_scale)
@@ -374,13 +376,16 @@ def _agreeing(
         z = jax.lax.cond(
             number > 0, lambda: compare(ends, determinant, coarse, fine, len(marches) * count, gain, rtol), lambda: none
         )
+        # Twice the panels divide a small truncation by hundreds; what stays is rounding, which grows with their number.
+        stalled = (number > 1) & (z.truncation < _SMALL_TRUNCATION) & (z.truncation > before.truncation / 4)
         # The whole ratio: with 5 panels after 2 the bound would be 100 times that of 8 after 2.
-        return number + 1, jnp.where(number == 0, ratio * first, 2 * count), fine, z
+        return number + 1, jnp.where(number == 0, ratio * first, 2 * count), fine, z, stalled
 
     first = jnp.maximum(-(-panels // ratio), 1)
     start = _State.start(n, lanes).propagator(first)
     none = jax.tree.map(lambda x: jnp.broadcast_to(x[..., None], (*x.shape, lanes)), unknown(n))
-    _, _, propagator, z = jax.lax.while_loop(unfinished, refine, (jnp.int32(0), first, start, none))
+    stalled = jnp.zeros(lanes, bool)
+    _, _, propagator, z, _ = jax.lax.while_loop(unfinished, refine, (jnp.int32(0), first, start, none, stalled))
     return propagator.matrix, z
 
 
