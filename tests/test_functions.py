@@ -62,7 +62,8 @@ def replaced(system, name, value):
     return type(system).of(system.values | {name: value})
 
 
-@pytest.mark.parametrize("case", but_full(CASES, *(CASES.keys() - {"bicardan critical_speeds"})))
+@pytest.mark.full
+@pytest.mark.parametrize("case", CASES)
 def test_a_batch_equals_the_loop_and_the_sweep(case):
     function, system, name, values, rtol = CASES[case]
     batch = jax.vmap(lambda x: replaced(system, name, x))(jnp.asarray(values))

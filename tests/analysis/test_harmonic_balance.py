@@ -125,6 +125,7 @@ def test_branch_passes_the_folds(swept):
     np.testing.assert_allclose(branch[:, [2, 0]], swept["u_max"][between, :, 0], rtol=1e-9)
 
 
+@pytest.mark.full
 def test_folds_of_the_branch():
     model, basis = model_of(({},), 0.7), hb.Basis(15)
     start = jnp.zeros((basis.size, 1)).at[0].set(0.06).at[1].set(0.3)

@@ -302,6 +302,7 @@ def test_tracks_follow_neighbours_in_any_order_of_points(order):
     xr.testing.assert_allclose(rising[["branch", "mac"]], listed[["branch", "mac"]].sortby("k_cu"), rtol=1e-12)
 
 
+@pytest.mark.full
 def test_branches_keep_their_type_where_frequencies_cross(tracked):
     """The rotational mode of the held carrier crosses translational modes; every branch keeps its type."""
     types, branch = tracked.mode_type.values, tracked.branch.values
@@ -313,6 +314,7 @@ def test_branches_keep_their_type_where_frequencies_cross(tracked):
     assert not (branch == np.arange(1, 22)).all()
 
 
+@pytest.mark.full
 def test_mac_is_high_and_frequencies_stay_rising(tracked):
     assert (tracked.mac.values > 0.9).all() and (tracked.mac.values <= 1).all()
     assert (tracked.mac.values[:, 0] == 1).all()

@@ -59,6 +59,7 @@ def test_determinants_are_those_of_numpy():
     np.testing.assert_allclose(determinant(jnp.asarray(a)), np.linalg.det(np.moveaxis(a, -1, 0)), rtol=1e-12)
 
 
+@pytest.mark.full
 def test_history_of_the_shaft_against_scipy():
     start = {"theta1_0": 0.1, "theta2_0": -0.05, "theta1_rate_0": 0.2, "theta2_rate_0": 0.3}
     shaft = dt.Cardan(beta=0.8, Omega=1.3, **BASE, **start)

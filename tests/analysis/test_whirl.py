@@ -84,6 +84,7 @@ ISOTROPIC = [name for name in CASES if not name.startswith("anisotropic")]
 ANISOTROPIC = [name for name in CASES if name.startswith("anisotropic")]
 
 
+@pytest.mark.full
 def test_every_reference_value_to_rounding():
     """Brackets close at 4 units in the last place of sqrt(omega), and the inputs are rounded to 53 bits: 4e-15 together."""
     shafts, expected, labels = [], [], []

@@ -142,6 +142,7 @@ def test_what_plot_takes(folder, chart):
     assert zoom.axes[0].get_xlim() == same.axes[0].get_xlim() and 1.29 < zoom.axes[0].get_xlim()[0] < 1.31
 
 
+@pytest.mark.full
 def test_a_chart_shows_the_tongues_of_its_atlas(folder, chart):
     """The cells of this chart step over the tip of S21."""
     lines = {line.get_label(): line for line in dt.plot(chart, folder / "atlas.nc").axes[0].get_lines()}

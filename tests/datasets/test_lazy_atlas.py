@@ -227,6 +227,7 @@ def test_physical_data_make_a_grid(file, atlas):
         opened(file, {"speed": (1100.0, 1700.0, 4)})
 
 
+@pytest.mark.full
 def test_axes_of_a_scene_in_physical_data_name_the_results():
     """Axes of the scene name dimensions and values in its units; numbers in a question have the quantity's own unit."""
     file = atlas_file(SHAFT)

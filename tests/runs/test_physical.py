@@ -246,6 +246,7 @@ def every_door(given, modes):
 UNIFORM = {"length": ["750 mm", "750 mm"], "outer_diameter": "90 mm", "k_A": 1e8, "k_D": 1e8}
 
 
+@pytest.mark.full
 def test_one_diameter_stands_for_all_segments():
     for found in every_door(UNIFORM | {"material": "steel"}, 2):
         assert found == pytest.approx([4671.14, 16452.8], rel=1e-6)
