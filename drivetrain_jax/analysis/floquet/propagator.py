@@ -2,10 +2,10 @@
 
 A system ``q' = p, p' = P q + E p`` is marched in its second derivatives, any other system in its slopes
 (:mod:`~drivetrain_jax.analysis.numerics.collocation`). A step marches a coarse and a fine number of panels, compares the
-monodromy matrices and doubles the panels until they agree. Under ``jax.vmap`` each block of lanes is one kernel with all of
-this, so that a difficult point repeats only its own block. The number of panels is a traced integer: one compilation serves
-every accuracy. The entries of ``A`` at all nodes of a panel are evaluated together, so that common expressions are computed
-once (:func:`staged`).
+monodromy matrices and doubles the panels until they agree or differ by rounding alone. Under ``jax.vmap`` each block of
+lanes is one kernel with all of this, so that a difficult point repeats only its own block. The number of panels is a traced
+integer: one compilation serves every accuracy. The entries of ``A`` at all nodes of a panel are evaluated together, so that
+common expressions are computed once (:func:`staged`).
 """
 
 from __future__ import annotations
