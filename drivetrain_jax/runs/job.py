@@ -131,8 +131,14 @@ class Job:
 
     def plan(self, block: Block) -> tuple[Chunk, ...]:
         """The chunks of a block."""
-        full_size = self._full_size or self.boxes.count > 1
-        return make_plan(self.solvers, self.grid, self.points(block), full_size=full_size)
+        return make_plan(self.solvers, self.grid, self.points(block), self._longest)
+
+    @cached_property
+    def _longest(self) -> int | None:
+        """Most points of a chunk, the same for all blocks: a longer chunk would be padded; None for a job of one block."""
+        if self._full_size:
+            return _MOST_POINTS
+        return _PADDED * -(-int(np.diff(self._starts).max()) // _PADDED) if self.boxes.count > 1 else None
 
     @cached_property
     def _few(self) -> bool:
@@ -205,8 +211,8 @@ _MAX_EFFORT, _BITS = 2**31 - 1, 32
 # Least number of chunks per solver in a small scene. A constant, because bits must not depend on the number of cores.
 _MIN_CHUNKS = 2
 # Points of the smallest chunk of more than one point, and predicted seconds of a chunk that is not divided: compiling
-# another kernel takes longer.
-_LANES, _BRIEF = 16, 0.02
+# another kernel takes longer. Chunks of a block have a multiple of these points, the widest vectors.
+_LANES, _BRIEF, _PADDED = 16, 0.02, 8
 
 
 @dataclass(frozen=True)
@@ -238,12 +244,12 @@ def block_size(solvers: Sequence[Solver], grid: Grid) -> int:
 
 
 def make_plan(
-    solvers: Sequence[Solver], grid: Grid, points: np.ndarray, *, full_size: bool = False
+    solvers: Sequence[Solver], grid: Grid, points: np.ndarray, longest: int | None = None
 ) -> tuple[Chunk, ...]:
     """Chunks of ``points``, each by the solver of the smallest predicted cost; the most expensive chunk comes first.
 
-    Points of infinite predicted cost belong to no chunk. Chunks of few points are smaller, unless they have ``full_size``;
-    so those of several blocks need no further kernels.
+    Points of infinite predicted cost belong to no chunk. Chunks of few points are smaller, unless they have the solver's
+    size up to ``longest``; so those of several blocks need no further kernels.
     """
     pieces = [points[start : start + _PIECE] for start in range(0, len(points), _PIECE)]
     if len(pieces) > 1:
@@ -261,7 +267,7 @@ def make_plan(
         keys = ((_MAX_EFFORT - effort[rows]) << _BITS) | rows
         keys.sort()
         rows = keys & ((1 << _BITS) - 1)
-        size = solver.chunk if full_size else chunk_size(solver, rows.size, int(effort[rows[0]]))
+        size = min(solver.chunk, longest) if longest else chunk_size(solver, rows.size, int(effort[rows[0]]))
         for start in range(0, rows.size, size):
             part = rows[start : start + size]
             most = int(effort[part[0]])

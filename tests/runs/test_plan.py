@@ -68,6 +68,14 @@ def test_a_run_of_a_few_seconds_has_sixteen_blocks(monkeypatch, seconds, points)
     assert block_size([Solver("s", lambda *_: {}, chunk=16, seconds=seconds)], grid) == points
 
 
+def test_a_chunk_is_no_longer_than_its_block():
+    """Every lane of padding costs as much as a point."""
+    grid = Grid.of(load_scene({"system": "toy", "analysis": "toy", "points": {"a": np.linspace(1, 2, 34).tolist()}}))
+    fast, slow = (Solver("s", lambda *_: {}, lambda columns: np.ones(34), unit_cost=c, chunk=64) for c in (1.0, 2.0))
+    for longest, sizes in ((40, [40]), (16, [16, 16, 16]), (80, [64]), (None, [64])):
+        assert [chunk.size for chunk in make_plan([slow, fast], grid, np.arange(34), longest)] == sizes
+
+
 @pytest.mark.parametrize(
     ("effort", "planned"),
     [
