@@ -34,7 +34,7 @@ THEOREM = (
 )
 # Target of the truncation error, nodes per polynomial, relative enlargement of the box, lines and points computed together,
 # and the largest number of polynomials, which take ten seconds of CPU time.
-_TRUNCATED, _FINER, _BEYOND, _LINES, _POINTS, _MOST_NODES = 1e-12, 1.5, 1e-9, 16, 2048, 10_000
+_TRUNCATED, _FINER, _BEYOND, _LINES, _POINTS, _MOST_NODES = 1e-12, 1.5, 1e-9, 32, 2048, 10_000
 # Least log det Z: below it the terms of second order of an enclosure are too large.
 _STRONG = -44.0
 # Ratio of a stored bound to the computed one, for other processors that round differently.
