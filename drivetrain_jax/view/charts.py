@@ -60,8 +60,8 @@ _ALARMING, _COUNTED = ("undecided", FAILED, PENDING), 1000
 _PALE = 0.35
 # Most panels of lines; most values of a further axis that all have a map; most entries of a dimension in a table.
 _MOST_PANELS, _FEW_MAPS, _MOST_ENTRIES = 8, 4, 24
-# Line spacing of a table in inches.
-_ROW = 0.24
+# Line spacing of a table, least height of a map, and height of all maps, in inches.
+_ROW, _LOWEST, _PAGE = 0.24, 1.3, 10.0
 # Least range of a vertical axis relative to its values.
 _LEAST_RANGE = 0.01
 # Ratio of the largest to the smallest positive value above which a colour scale is logarithmic.
@@ -76,12 +76,14 @@ _BANDS = {
 }
 # Variables whose sum is the mean divergence of the flow.
 _SUMMED = ("lyapunov_spectrum", "paper_estimator")
+# Variables whose sign says whether disturbances grow, and the part of their scale that is linear.
+_EXPONENTS, _SMALL = ("lyapunov_spectrum", "floquet_exponent"), 1e-3
 # Position between largest decay (-1), none (0) and largest growth (1), and colour; lightness falls monotonically. White is
 # reserved for cells without a value.
 _GROWTH_COLOURS = (
     (-1.0, "#fbfce0"), (-0.5, "#a9dcc3"), (0.0, "#86b1d6"), (0.12, "#d98e48"), (0.5, "#b8432f"), (1.0, "#2d0a2b"),
 )  # fmt: skip
-# Distance of a spectral radius from 1 that rounding can make.
+# Distance of a spectral radius from 1 that rounding can make, and positive values relative to the largest.
 _ROUNDING = 1e-12
 
 
@@ -283,8 +285,8 @@ def colours(field: xr.DataArray, growth: Growth | None = None) -> tuple[dict[str
         return flag_scale(field), {}
     if growth is None:
         values = field.values[np.isfinite(field.values)]
-        positive = values[values > 0]
         low, high = (values.min(), values.max()) if values.size else (0.0, 1.0)
+        positive = values[values > _ROUNDING * high]
         logarithmic = low >= 0 and positive.size > 0 and high > _WIDE * positive.min()
         norm = LogNorm(positive.min(), high) if logarithmic else Normalize(low, high)
         return {"cmap": matplotlib.colormaps["cividis_r"].with_extremes(bad=FAILED_COLOUR), "norm": norm}, {}
@@ -417,7 +419,9 @@ def _small_multiples(dataset: xr.Dataset, fields: Sequence[str]) -> Figure:
     else:
         rows = [row for key in fields for row in split(parts[0], key)]
     titled = [*further[:2], *dict.fromkeys(own_dimension(dataset, key) for key in fields)]
-    sheet = maps(rows, (horizontal, vertical), height=1.8 if len(parts) > 1 else 2.5, titled=titled)
+    # At most a page.
+    height = 1.8 if len(parts) > 1 else min(2.5, max(_LOWEST, _PAGE / len(rows)))
+    sheet = maps(rows, (horizontal, vertical), height=height, titled=titled)
     drawn = len(across) * len(down)
     return sheet.finish(dataset, f"{drawn} of {total} charts shown" if drawn < total else "")
 
@@ -447,7 +451,7 @@ def maps(
     for name, numbers in alike.items():
         values = np.concatenate([field.values.ravel() for k in numbers for field in fields[k]])
         whole = xr.DataArray(values, attrs=fields[numbers[0]][0].attrs)
-        scales[name] = colours(whole, growth_of(rows[0][1][0]) if _is_radius(name) else None)
+        scales[name] = colours(whole, _signed(rows[0][1][0], name, whole))
         sheet.add(*(flag_entries(whole) if flags(whole) else ()))
     single, meshes = sheet.axes.size == len(rows), {}
     titles = [[_title(part, titled) for part in parts] for _, parts in rows]
@@ -485,6 +489,17 @@ def maps(
         sheet.axes[0, 0].xaxis.set_major_locator(MaxNLocator(4, prune="upper"))
     sheet.label(axis_label(part[names[0]]), axis_label(part[names[1]]))
     return sheet
+
+
+def _signed(part: xr.Dataset, name: str, field: xr.DataArray) -> Growth | None:
+    """The scale of a variable whose sign says whether disturbances grow; None for any other."""
+    if _is_radius(name):
+        return growth_of(part)
+    largest = np.nanmax(np.abs(field.values), initial=0.0)
+    if name not in _EXPONENTS or not largest:
+        return None
+    end = 10.0 ** np.ceil(np.log10(largest))
+    return Growth(1.0, variable_label(part[name]), _SMALL * end, end)
 
 
 def _mapped(part: xr.Dataset, name: str) -> xr.DataArray:

@@ -53,7 +53,7 @@ _NEAR, _SPLIT = 0.01, 1e-6
 _SPACE, _BEYOND, _FEW_MODES = 1.12, 1.4, 8
 # Width of a number relative to the range of speeds.
 _WIDTH = 0.08
-_NUMBER: dict[str, Any] = {"va": "top", "path_effects": [withStroke(linewidth=2, foreground="white")]}
+_NUMBER: dict[str, Any] = {"inside": True, "va": "top", "path_effects": [withStroke(linewidth=2, foreground="white")]}
 # Results that are drawn, the first one that is stored.
 _SPEEDS = ("critical_speed", *FREQUENCIES)
 # Line styles of the orders, and their colours in maps.
@@ -461,7 +461,11 @@ def whirl(dataset: xr.Dataset) -> Figure | None:
         return None
     charts.require(dataset, "whirl_frequency", "whirl_direction")
     charts.require_values(dataset["whirl_frequency"], positive=True)
-    dataset = dataset.sortby("speed").transpose("speed", ...)
+    dataset, frequency = dataset.sortby("speed").transpose("speed", ...), dataset["whirl_frequency"]
+    if (dataset["speed"].attrs.get("units"), frequency.attrs["units"]) == ("rpm", "rad/s"):
+        # Who counts turns counts oscillations, too.
+        turns = frequency.copy(data=in_hertz(frequency.values, "rad/s")).assign_attrs(units="Hz")
+        dataset = dataset.assign(whirl_frequency=turns)
     x, y, codes = (dataset[name].values for name in ("speed", "whirl_frequency", "whirl_direction"))
     y = np.where(np.isfinite(y), y, np.nan)
     isotropic = not any(f"k_{place}_y" in parameters(dataset) for place in ("A", "D", "joint"))

@@ -199,11 +199,19 @@ def plain_decades(axes: Axes, which: str) -> None:
 
 
 def write_names(
-    axes: Axes, points: Any, names: Sequence[str], *, above: bool = False, offset: float = 3.0, **look: Any
+    axes: Axes,
+    points: Any,
+    names: Sequence[str],
+    *,
+    above: bool = False,
+    inside: bool = False,
+    offset: float = 3.0,
+    **look: Any,
 ) -> None:
     """Write ``names`` to the right of ``points`` (or ``above``), ``offset`` points away, with a line to a name that moved.
 
-    Names keep the order of their points. Where there is no space for all, the first stay. ``look`` goes to
+    Names that would leave ``axes`` on the right stand at the left, if all are to be ``inside``. Names keep the order of
+    their points. Where there is no space for all, the first stay. ``look`` goes to
     :meth:`matplotlib.axes.Axes.annotate`, but for ``colours``: one for all names, or one for each.
     """
     colours = look.pop("colours", FRAME_GREY)
@@ -221,9 +229,12 @@ def write_names(
     for k, shift in zip(kept, shifts, strict=True):
         line = {"arrowstyle": "-", "linewidth": 0.5, "color": colours[k], "shrinkA": 1, "shrinkB": 0}
         style: dict[str, Any] = {"ha": "center", "va": "bottom"} if above else {"ha": "left", "va": "center"}
-        if offset > _NEAR or abs(shift) > 1:
-            style["arrowprops"] = line | {"relpos": (0.5, 0.0) if above else (0.0, 0.5)}
         beyond = max(offset, _NEAR + 4) if abs(shift) > 1 else offset
+        right = axes.transData.transform(points[k])[0] * scale + beyond + 72 * _LETTER * len(names[k])
+        if inside and right > axes.bbox.x1 * scale:
+            style["ha"], beyond = "right", -beyond
+        if offset > _NEAR or abs(shift) > 1:
+            style["arrowprops"] = line | {"relpos": (0.5, 0.0) if above else (float(beyond < 0), 0.5)}
         style |= {"size": 7.5, "color": colours[k], "annotation_clip": False, "textcoords": "offset points"} | look
         axes.annotate(names[k], points[k], (shift, beyond) if above else (beyond, shift), **style)
 

@@ -57,7 +57,11 @@ def test_curves_with_bands_and_verdicts():
 def test_maps_with_a_column_for_each_value_of_a_third_axis():
     figure = plot(lyapunov(excitation_frequency=6, zeta=5, chi_n=3))
     assert legend(figure) == ["quasi periodic (89)", "chaotic (1)"]
-    assert len([axes for axes in figure.axes if axes.get_label() != "<colorbar>"]) == 6
+    panels = [axes for axes in figure.axes if axes.get_label() != "<colorbar>"]
+    assert len(panels) == 6
+    # Growth and decay have colours of their own.
+    (mesh,) = panels[-1].collections
+    assert mesh.norm(0.0) == pytest.approx(0.5) and (mesh.norm.vmin, mesh.norm.vmax) == (-10.0, 10.0)
 
 
 @pytest.mark.parametrize("sizes", [{"zeta": 8}, {"zeta": 8, "chi_n": 1}, {"zeta": 4, "chi_n": 2}])

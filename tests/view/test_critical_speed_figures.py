@@ -191,3 +191,21 @@ def test_shapes_are_drawn_over_the_shaft_with_its_points():
     # Axes of one value are parts of the shaft, too.
     shorter = plot(shapes.assign_coords({"length[1]": 0.2, "k_A": 0.0})).axes[0]
     assert list(shorter.get_lines()[0].get_xdata()) == [0.5, 1.0]
+
+
+def test_whirl_over_turns_is_in_hertz_and_its_numbers_stay_inside():
+    """Two modes that do not depend on the speed: order 1 crosses one of them near the right end, forward whirl alone."""
+    rpm = np.linspace(0.0, 6000.0, 61)
+    frequency = 2 * np.pi * np.broadcast_to([20.0, 20.0, 99.0, 99.0], (61, 4))
+    senses = {"flag_values": np.int8([0, 1, 2]), "flag_meanings": "backward planar forward"}
+    data = {
+        "whirl_frequency": (("speed", "mode"), frequency, {"units": "rad/s", "long_name": "whirl frequency"}),
+        "whirl_direction": (("speed", "mode"), np.broadcast_to(np.int8([0, 2, 0, 2]), (61, 4)), senses),
+        "outcome": ("speed", np.zeros(61, "int8")),
+    }
+    coords = {"speed": ("speed", rpm, {"units": "rpm", "long_name": "speed"}), "mode": ("mode", [1, 2, 3, 4])}
+    attrs = {"system": "bicardan", "analysis": "whirl", "title": "A shaft", "fixed_parameters": "{}"}
+    axes = plot(xr.Dataset(data, coords, attrs)).axes[0]
+    assert "[Hz]" in axes.get_ylabel() and axes.get_ylim()[1] == pytest.approx(1.05 * 99)
+    numbers = {text.get_text(): text for text in axes.texts}
+    assert numbers["1200"].get_ha() == "left" and numbers["5940"].get_ha() == "right"
