@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import inspect
+import json
 import os
 import re
 import subprocess
 import sys
 from dataclasses import replace
+from typing import ClassVar
 
 import diffrax
 import jax
@@ -359,14 +361,17 @@ def test_registered_classes_are_known_by_name(tmp_path, monkeypatch):
 def test_a_sweep_of_an_unregistered_class_has_the_dimensions_of_its_analysis():
     class Falling(System):
         name, title, time_units = "falling", "y'' = -g", "s"
+        roles: ClassVar = {"speed": "g", "angle": "slope"}
         state = (Component("height", "m", "height"), Component("rate", "m/s", "rate"))
         g: float = parameter("m/s2", "acceleration")
+        slope: float = parameter("1", "slope of the ground")
 
         @serves("history")
         def flow(self):
             return Flow(lambda angles, y: (y[1], -self.g), (0.0, 0.0), period=1.0)
 
-    found = dt.sweep(dt.history, Falling(g=1.0), over={"g": [1.0, 2.0]}, stop=2.0, num=3)
+    found = dt.sweep(dt.history, Falling(g=1.0, slope=0.0), over={"g": [1.0, 2.0]}, stop=2.0, num=3)
+    assert found.attrs["title"] == "history of y'' = -g" and json.loads(found.attrs["roles"]) == {"speed": "g"}
     assert found.time.values.tolist() == [0.0, 1.0, 2.0] and found.height.attrs["units"] == "m"
     np.testing.assert_allclose(found.height[1], [0.0, -1.0, -4.0], atol=1e-9)
 

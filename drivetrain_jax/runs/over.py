@@ -204,8 +204,10 @@ def _kind(
     dimensions = tuple((numbered | {d.name: d for d in dims if d.name in entries}).values())
     models = {name: Model(lambda values: values, varies)}
     body = {"name": FUNCTION, "title": of.__name__, "parameters": (*parameters, computing), "models": models}
-    # Analyses ask for them, and figures show them.
-    body |= {key: getattr(of, key) for key in ("state", "state_axis", "displacements") if issubclass(of, System)}
+    if issubclass(of, System):
+        # Analyses ask for them, and figures show them.
+        body |= {key: getattr(of, key) for key in ("state", "state_axis", "displacements")}
+        body |= {"title": of.title, "roles": {role: key for role, key in of.roles.items() if key in varies}}
     outputs, methods, solver = (tuple(v.name for v in variables), {"function": ()}, Solver(name, over_lanes(solve)))
     given = (name, f"function {name}", variables, outputs, methods, (), lambda *_: (solver,), lambda *_: dimensions)
     return type("Function", (System,), body), Analysis(*given)

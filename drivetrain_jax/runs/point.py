@@ -282,7 +282,8 @@ def _with_entries(given: Mapping[str, Any]) -> dict[str, Any]:
         parameter, position = cast(tuple[str, int], entry_of(name))
         entries = list(placed[parameter]) if np.ndim(placed.get(parameter, 0)) else []
         if position >= len(entries):
-            allowed = f"an entry of the list {parameter}, which has {len(entries)}"
+            beside = f"the list {parameter} beside it"
+            allowed = f"an entry of the list {parameter}, which has {len(entries)}" if entries else beside
             raise InputError(f"{name} = {shown(given[name])}: expected {allowed}")
         entries[position] = given[name]
         placed[parameter] = entries

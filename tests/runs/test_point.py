@@ -194,7 +194,12 @@ def test_one_entry_of_a_list_is_given_alone():
     found = dt.point("driveline", "phasing", **lists, **{"beta[1]": "20 deg", "k[0]": 3.0})
     assert found.parameters["k"] == (3.0, 2.0)
     assert found.parameters["beta"] == pytest.approx((0.1, np.radians(20)), rel=1e-15)
-    for name, given, count in (("beta[2]", lists, 2), ("beta[0]", {}, 0), ("speed[0]", {"speed": 3.0}, 0)):
-        parameter = name.partition("[")[0]
-        with pytest.raises(dt.InputError, match=f"expected an entry of the list {parameter}, which has {count}$"):
+    few = "an entry of the list beta, which has 2"
+    cases = (
+        ("beta[2]", lists, few),
+        ("foo[0]", {}, "the list foo beside it"),
+        ("speed[0]", {"speed": 3.0}, "the list speed"),
+    )
+    for name, given, allowed in cases:
+        with pytest.raises(dt.InputError, match=f"expected {allowed}"):
             dt.point("driveline", "phasing", **given, **{name: 0.3})
