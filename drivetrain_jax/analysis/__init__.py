@@ -56,7 +56,7 @@ def analysis_names() -> tuple[str, ...]:
 
 
 def get_analysis(name: str) -> Analysis:
-    """The analysis ``name``; ``KeyError`` if there is none, :class:`InputError` if its package fails."""
+    """The analysis ``name``; :class:`InputError` with the known names if there is none, or if its package fails."""
     if name in _BUILT_IN:
         module, _, record = _BUILT_IN[name].partition(":")
         return getattr(import_module(f"{__name__}.{module}"), record)
@@ -64,7 +64,7 @@ def get_analysis(name: str) -> Analysis:
 
     analysis = load_plugin(ANALYSES, name, "an analysis", lambda x: isinstance(x, Analysis))
     if analysis is None:
-        raise KeyError(name)
+        raise InputError(f"analysis = {name!r}: unknown{nearest(str(name), analysis_names())}")
     if analysis.uses and analysis.uses not in analysis_names():
         raise InputError(
             f"analysis = {name!r}: uses = {analysis.uses!r}: no analysis{nearest(analysis.uses, analysis_names())}"
@@ -74,16 +74,12 @@ def get_analysis(name: str) -> Analysis:
 
 def analysis_of(system: type[System], name: str) -> Analysis:
     """The analysis ``name`` of ``system``, with what it declares; :class:`InputError` if it has no model for it."""
-    try:
-        analysis = get_analysis(name)
-        # The model first: only a system with one declares what the analysis takes from its class.
-        analysis.model(system)
-    except KeyError:
+    analysis = get_analysis(name) if name in analysis_names() else None
+    # The model first: only a system with one declares what the analysis takes from its class.
+    if analysis is None or (analysis.uses or analysis.name) not in system.models:
         known = analyses_of(system)
         guess = did_you_mean(str(name), known)
-        raise InputError(
-            f"analysis = {name!r}: unknown to {system.name}{guess}; expected one of {', '.join(known)}"
-        ) from None
+        raise InputError(f"analysis = {name!r}: unknown to {system.name}{guess}; expected one of {', '.join(known)}")
     return analysis.for_system(system)
 
 

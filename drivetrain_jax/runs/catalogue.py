@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from pathlib import Path
 
-from drivetrain_jax._errors import InputError, aligned, did_you_mean, nearest, written
+from drivetrain_jax._errors import InputError, aligned, did_you_mean, written
 from drivetrain_jax._quantities import Parameter, Variable
 from drivetrain_jax.analysis import analyses_of, analysis_names, broken_analyses, get_analysis
 from drivetrain_jax.runs import toml
@@ -58,8 +58,6 @@ def describe(name: str) -> str:
 def _analysis_lines(name: str, system: type[System]) -> list[str]:
     try:
         analysis = get_analysis(name).for_system(system)
-    except KeyError:
-        return [f"Analysis {name}: unknown{nearest(name, analysis_names())}"]
     except InputError as error:
         return [f"Analysis {name}: {str(error).partition(': ')[2]}"]
     lacking = analysis.lacks(system)

@@ -81,7 +81,7 @@ class Problem:
         try:
             system = get_system(self.system.name)
             return system is self.system and self.find_analysis(self.analysis.name).for_system(system) == self.analysis
-        except (InputError, KeyError):
+        except InputError:
             return False
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -196,7 +196,8 @@ ANALYSES = {
 def names(replace=setattr) -> None:
     """Make the toys known to scenes; ``replace`` may be ``monkeypatch.setattr``."""
     replace(systems, "_REGISTERED", {**systems._REGISTERED, "toy": Toy})
-    known = analysis.get_analysis
+    known, names_of = analysis.get_analysis, analysis.analysis_names
+    replace(analysis, "analysis_names", lambda: (*names_of(), *ANALYSES))
     for module in (analysis, scene):
         replace(module, "get_analysis", lambda name: ANALYSES[name] if name in ANALYSES else known(name))
 
