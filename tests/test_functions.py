@@ -376,6 +376,14 @@ def test_a_sweep_of_an_unregistered_class_has_the_dimensions_of_its_analysis():
     np.testing.assert_allclose(found.height[1], [0.0, -1.0, -4.0], atol=1e-9)
 
 
+def test_arrays_inside_a_jitted_function_belong_to_it():
+    def gain(table):
+        return jax.jit(lambda p: p["a"] * jax.jit(lambda x: jnp.dot(x, x))(np.array(table)))
+
+    for table, gain_of_table in (([1.0, 2.0], 5.0), ([3.0, 4.0], 25.0)):
+        assert swept(gain(table))["lambda"].values[-1] == gain_of_table * swept(lambda p: p["a"])["lambda"].values[-1]
+
+
 def test_what_python_computes_on_the_host_is_never_reused(tmp_path):
     def times(factor):
         shape = jax.ShapeDtypeStruct((), float)

@@ -333,6 +333,9 @@ def scene_digest(scene: Problem, solvers: Sequence[Solver], numerics: str) -> st
     return digest(
         scene_content(scene)
         | {
+            # They are no numbers of the computation, but the result has them as labels and attributes.
+            "parts": list(getattr(scene, "parts", ())),
+            "data": dict(getattr(scene, "data", {})),
             "solvers": [[solver.name, solver.chunk, solver.unit_cost] for solver in solvers],
             "version": drivetrain_jax.__version__,
             "numerics": numerics,

@@ -152,7 +152,7 @@ def _function_scene(
         raise InputError(f"outputs: {lacking!r} is not a result of {name}{nearest(str(lacking), offered)}")
     if offered and not wanted:
         raise InputError(f"outputs = {shown(outputs)}: expected one or more of {', '.join(offered)}")
-    content = [re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr)), *(np.asarray(x).tobytes() for x in traced.consts)]
+    content = [re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr)), *(np.asarray(x).tobytes() for x in _constants(traced))]
     if " callback=" in content[0]:
         # What Python computes on the host may change unseen.
         content.append(uuid.uuid4().hex)
@@ -241,6 +241,17 @@ def _named(result: Any, name: str) -> dict[str, Array]:
             allowed = f"expected one integer, a code of the outcome from 0 to {max(Outcome)}, or another name"
             raise InputError(f"outcome: the function returns {array.dtype} of the shape {array.shape}; {allowed}")
     return arrays
+
+
+def _constants(traced: Any) -> list[Any]:
+    """The constants of a jaxpr and of the ones inside it, such as those of functions under ``jax.jit``."""
+    consts, jaxpr = list(getattr(traced, "consts", ())), getattr(traced, "jaxpr", traced)
+    for value in (value for eqn in jaxpr.eqns for value in jax.tree.leaves(list(eqn.params.values()))):
+        if hasattr(value, "eqns") or hasattr(value, "jaxpr"):
+            consts += _constants(value)
+        elif hasattr(value, "dtype") and hasattr(value, "shape"):
+            consts.append(value)
+    return consts
 
 
 def _check_concrete(*values: Any) -> None:

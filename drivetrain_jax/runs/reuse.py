@@ -161,16 +161,23 @@ def _same_points(scene: Scene, grid: Grid, job: Job) -> tuple[np.ndarray, np.nda
     several = any(axis.also for one in grids for axis in one.axes)
     if several or lines[0] != lines[1] or constants[0] != constants[1]:
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    keys = [np.zeros(one.shape, np.int64) for one in grids]
+    keys, count = [np.zeros(one.shape, np.int64) for one in grids], 1
     for name in names:
         # A parameter that an analysis does not use has any value.
         if not all(entry_of(name)[0] in one.analysis.model(one.system).parameters for one in scenes):
             continue
         values = [np.atleast_1d({**f, **c}.get(name, np.nan)) for c, f in zip(columns, fixed, strict=True)]
         codes = equal_codes(*values)
+        different = 1 + int(max(codes[0].max(), codes[1].max()))
+        if count * different > np.iinfo(np.int64).max:
+            # As few numbers as there are different keys, at most one per point.
+            dense = np.unique(np.concatenate([key.reshape(-1) for key in keys]), return_inverse=True)[1]
+            keys = [part.reshape(key.shape) for part, key in zip(np.split(dense, [keys[0].size]), keys, strict=True)]
+            count = 1 + int(dense.max())
+        count *= different
         for one, key, code in zip(grids, keys, codes, strict=True):
             place = next((i for i, axis in enumerate(one.axes) if axis.name == name), None)
-            key *= 1 + max(codes[0].max(), codes[1].max())
+            key *= different
             if place is None or one.zipped:
                 key += code[0] if place is None else code
             else:
@@ -203,7 +210,10 @@ def equal_codes(*columns: np.ndarray) -> list[np.ndarray]:
     rising, pairs = values[order].astype(float), np.sort([extents[order][1:], extents[order][:-1]], axis=0)
     # The smaller tolerance of both, or the only one.
     extent = np.where(pairs[0] > 0, *pairs)
-    differs = ~(np.diff(rising) <= _ROUNDINGS * (abs(rising[1:]) + extent))
+    with np.errstate(invalid="ignore"):
+        near = np.diff(rising) <= _ROUNDINGS * (abs(rising[1:]) + extent)
+    # Nothing is near to infinity.
+    differs = ~np.where(np.isfinite(rising[1:]), near, rising[1:] == rising[:-1])
     codes = np.empty(len(values), np.int64)
     codes[order] = np.concatenate([[0], np.cumsum(differs)])
     return np.split(codes, ends)
@@ -259,7 +269,8 @@ def _entries(scene: Scene, points: bool) -> dict[str, Any]:
     if points:
         shown = [axis.shown for axis in scene.axes]
         entries |= {"outputs": ", ".join(content["outputs"]), where: ", ".join(axis.name for axis in shown)}
-        entries |= {f"fixed.{name}": value for name, value in sorted(content["fixed"].items())}
+        entries |= {f"fixed.{name}": value for name, value in sorted({**scene.data, **content["fixed"]}.items())}
+        entries |= {"parts": scene.parts}
         for axis in shown:
             ends = " to ".join(f"{x:.15g}" for x in axis.values[[0, -1]])
             entries[f"{where}.{axis.name}"] = f"the range from {ends}" if scene.analysis.continuous else axis.values

@@ -25,6 +25,14 @@ def digest(scene):
     return resolve(load_scene(scene)).digest
 
 
+def test_physical_data_and_names_of_parts_belong_to_the_result():
+    """Orders follow from the teeth, and labels are the names: nothing is computed from them, and a reader sees them."""
+    gear = {"system": "planetary", "analysis": "modes"}
+    assert len({digest(gear | {"fixed": {"teeth": t}}) for t in ([20, 26, 72], [30, 39, 108])}) == 2
+    chain = {"system": "driveline", "analysis": "phasing", "fixed": {"beta": [0.1, 0.1]}}
+    assert len({digest(chain | {"parts": parts}) for parts in (["front", "rear"], ["rear", "front"])}) == 2
+
+
 @pytest.mark.parametrize(
     "same",
     [

@@ -11,9 +11,12 @@ from interrupts import stop_after
 import drivetrain_jax as dt
 from drivetrain_jax import InputError
 from drivetrain_jax.analysis import Outcome
+from drivetrain_jax.runs.axes import Grid
 from drivetrain_jax.runs.output import status
-from drivetrain_jax.runs.reuse import equal_codes
+from drivetrain_jax.runs.resolve import resolve
+from drivetrain_jax.runs.reuse import _same_points, equal_codes
 from drivetrain_jax.runs.run import Interrupted, run_to_file
+from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.runs.work import Threads
 from drivetrain_jax.store import checksums
 from tests.sizes import full_after
@@ -113,6 +116,24 @@ def test_axis_values_equal_to_rounding_are_the_same(old, new):
     few, many = sorted((old, new), key=len)
     for codes in (equal_codes(few, many), equal_codes(many, few)[::-1]):
         assert np.isin(*codes).all() and len({*codes[1]}) == len(many)
+
+
+def test_nothing_is_near_to_infinity():
+    few, many = equal_codes(np.array([85e6]), np.array([85e6, np.inf, np.inf]))
+    assert few[0] == many[0] != many[1] == many[2]
+
+
+def test_many_parameters_of_many_values_make_different_points():
+    """The number of possible points, 2^64 and more, is no integer of 64 bits."""
+    count = 1 << 16
+    values = {name: 1 + np.random.default_rng(i).permutation(count) / count for i, name in enumerate(("a", "b"))}
+    values |= {f"length[{i}]": values["b"][::-1] + i for i in range(3)}
+    small = {"system": "toy", "analysis": "toy", "fixed": {"length": [1.0, 2.0, 3.0]}, "points": values}
+    # The second half has another ``a``.
+    other = values | {"a": values["a"] + 5 * (np.arange(count) >= count // 2)}
+    one, job = load_scene(small), resolve(load_scene(small | {"points": other}))
+    for numbers in _same_points(one, Grid.of(one), job):
+        assert np.sort(numbers).tolist() == list(range(count // 2))
 
 
 def test_values_are_reused_not_computed(tmp_path):
