@@ -51,6 +51,10 @@ def with_parameters(
             known[base] = value
         elif isinstance(whole := known.get(base), tuple) and entry < len(whole):
             known[base] = (*whole[:entry], value, *whole[entry + 1 :])
+        elif axis in swept:
+            text = f" = {shown(fixed[base])}" if base in fixed else ": missing"
+            allowed = f"{base}[0] to {base}[{len(whole) - 1}]" if isinstance(whole, tuple) else "a list of numbers"
+            raise InputError(f"fixed.{base}{text}: {axis.name} varies one entry; expected {allowed}")
     everything = physical.all_converted(known)
     parameters = {name: value for name, value in everything.items() if name not in physical.names}
     constant = {
@@ -78,6 +82,10 @@ def _converted_axes(
             if isinstance(values, Along):
                 key = name if entry is None else f"{name}[{entry}]"
                 columns.setdefault(values.axis, []).append(Axis(key, system.parameter(name), entry, values.values))
+    own = {axis.name for axis in axes if axis not in swept}
+    if double := next((axis.name for follow in columns.values() for axis in follow if axis.name in own), None):
+        where, names = "points" if zipped else "axes", " and ".join(axis.name for axis in swept)
+        raise InputError(f"{where}.{double}: follows from {names}, given too; expected one of them")
     if zipped:
         plain = [axis for axis in axes if axis not in swept]
         return (*plain, *_joined(columns.get(_POINT, []), swept))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 
 import jax
 import numpy as np
@@ -231,6 +232,26 @@ def test_one_diameter_may_vary():
     assert found.EI_1.dims == ("outer_diameter_1",) and found.EI_1.attrs["parameter"] == "EI[1]"
     wide = dt.point("bicardan", "critical_speeds", **SHAFT | {"outer_diameter": [0.06, 0.1, 0.06]}, modes=1)
     assert found.critical_speed.values[1] == pytest.approx(wide.critical_speed, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("axes", "message"),
+    [
+        (
+            {"inner_diameter[1]": [0, 0.04]},
+            "fixed.inner_diameter = 0.0: inner_diameter[1] varies one entry; expected a list",
+        ),
+        ({"outer_diameter[5]": [0.04, 0.05]}, "varies one entry; expected outer_diameter[0] to outer_diameter[2]"),
+        (
+            {"outer_diameter[1]": [0.04, 0.05], "EI[1]": [1e4, 9e4]},
+            "axes.EI[1]: follows from outer_diameter[1], given too",
+        ),
+    ],
+)
+def test_every_axis_of_physical_data_has_an_effect(axes, message):
+    fixed = SHAFT | {"inner_diameter": 0, "outer_diameter": [0.06, 0.1, 0.06]}
+    with pytest.raises(dt.InputError, match=re.escape(message)):
+        dt.run({"system": "bicardan", "analysis": "critical_speeds", "axes": axes, "fixed": fixed})
 
 
 def every_door(given, modes):
