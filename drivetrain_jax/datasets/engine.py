@@ -239,7 +239,7 @@ class _Cells:
         if name == "proved":
             cells = np.meshgrid(*varied.values(), indexing="ij")
             return self._proved({**numbers, **dict(zip(varied, cells, strict=True))}, self.block(key, "verdict"))
-        return self._cached(columns, name, lambda: self.atlas(numbers).arrays(varied, solve=self.solve))
+        return self._cached("block", columns, name, lambda: self.atlas(numbers).arrays(varied, solve=self.solve))
 
     def points(self, positions: Sequence[Any], name: str) -> np.ndarray:
         """The result ``name`` at points, given by their positions along each axis, numbers or arrays of equal shape."""
@@ -248,20 +248,22 @@ class _Cells:
         if name == "proved":
             return self._proved(columns, self.points(positions, "verdict"))
         rows = {axis: column.reshape(-1) for axis, column in columns.items()}
-        values = self._cached(columns, name, lambda: self.atlas({}).arrays(rows, zipped=True, solve=self.solve))
+        values = self._cached(
+            "points", columns, name, lambda: self.atlas({}).arrays(rows, zipped=True, solve=self.solve)
+        )
         return values.reshape(shape + values.shape[1:])
 
     def _proved(self, columns: Mapping[str, Any], verdict: np.ndarray) -> np.ndarray:
         return _opened(self.path, self._stamp).proved({**self.fixed, **columns}, verdict)
 
     def _cached(
-        self, columns: Mapping[str, np.ndarray], name: str, evaluate: Callable[[], Mapping[str, np.ndarray]]
+        self, kind: str, columns: Mapping[str, np.ndarray], name: str, evaluate: Callable[[], Mapping[str, np.ndarray]]
     ) -> np.ndarray:
         """One result of a selection; the other results of the newest selections are kept until they are requested.
 
         The verdict stays, because the flags of what is proved need it.
         """
-        key = tuple((column.shape, column.tobytes()) for column in columns.values())
+        key = (kind, *((column.shape, column.tobytes()) for column in columns.values()))
         kept = self._kept.get(key, {})
         if (values := kept.get(name) if name == "verdict" else kept.pop(name, None)) is None:
             results = {other: np.asarray(values) for other, values in evaluate().items()}

@@ -97,6 +97,17 @@ def test_selections_are_the_grid_of_their_values(file, atlas, evaluated):
     assert turned.values.shape == (60, 40) and evaluated == [2400]
 
 
+def test_a_block_is_not_the_points_of_its_rows(file):
+    rows, places = [1, 5], xr.DataArray([1, 5], dims="p")
+    selections = {"beta": rows, "Omega": rows}, dict.fromkeys(("beta", "Omega"), places)
+    for order in (selections, selections[::-1]):
+        found = opened(file, 16)
+        block, points = (found.isel(s)["spectral_radius"].values for s in order)
+        block, points = (block, points) if order is selections else (points, block)
+        assert block.shape == (2, 2)
+        np.testing.assert_allclose(np.diag(block), points, rtol=1e-14)
+
+
 def test_scattered_points_are_evaluated_one_by_one(file, atlas, evaluated):
     random = np.random.default_rng(0)
     places = {name: xr.DataArray(random.integers(0, 10_000, (4, 25)), dims=("a", "b")) for name in ("beta", "Omega")}
