@@ -62,7 +62,9 @@ def _slow_modes(shaft: Shaft) -> Array:
     if second:
         none = jnp.zeros_like(free)
         free = jnp.concatenate([jnp.concatenate([free, none], 1), jnp.concatenate([none, second[0]], 1)])
-        same, other = mass + backward, mass - backward
+        # Not the mean of both: beside the gyroscopic effect the masses would be rounded away.
+        still = shaft._replace(spin=None, polar=None, rhoIp=None)
+        same, other = 2 * _masses(still, at_ends, ends), mass - backward
         mass = jnp.concatenate([jnp.concatenate([same, other], 1), jnp.concatenate([other, same], 1)])
     matrix = matmul(jnp.swapaxes(free, 0, 1), matmul(mass, free))
     flat = -matrix.reshape(*matrix.shape[:2], -1)
