@@ -248,7 +248,7 @@ def _range(function: Callable[[Any], Any], period: Any) -> Any:
             moved = t - first / jnp.where(second == 0, jnp.inf, second)
             t = jnp.clip(moved, start - step, start + step)
         ends.append(function(t))
-    return ends[0] - ends[1]
+    return jnp.maximum(ends[0] - ends[1], 0.0)
 
 
 def _moved(b: Any, rho: Any, phase: Any) -> Any:
@@ -257,19 +257,30 @@ def _moved(b: Any, rho: Any, phase: Any) -> Any:
     return (b + a) / (1 + jnp.conj(a) * b)
 
 
+def _is_unit(gear: Any) -> Any:
+    """True if a product of ratios is 1 or -1, up to rounding."""
+    return jnp.abs(jnp.abs(gear) - 1) <= _WHOLE
+
+
 def best_phases(beta: Components, phase: Components, ratio: Components) -> list[Any]:
-    """Phases in [0, pi) that minimise the uneven rotation between gears; the first joint behind a gear keeps its own.
+    """Phases in [0, pi) that minimise the uneven rotation of joints at one speed, of which the first one keeps its own.
 
     A joint moves a point of the hyperbolic plane by l = ln sec(beta) in the direction of its phase, eq. (8). The path closes
     if no l is longer than all others together; each joint turns back as far as the remaining ones can make up for.
     """
     phases, b, lengths = [], jnp.zeros((), complex), [-jnp.log(jnp.cos(x)) for x in beta]
+    gear: Any = 1.0
     for i, (p, length) in enumerate(zip(phase, lengths, strict=True)):
-        # Joints behind the next gear make up for nothing.
-        together, total, longest = True, 0.0, 0.0
-        for r, after in zip(ratio[i:], lengths[i + 1 :], strict=False):
-            together &= r == 1
+        bent = length != 0
+        # Gears from one joint to the next whose ratios multiply to 1 change nothing; to -1, they mirror the rotation.
+        passed = jnp.where(_is_unit(gear), jnp.where(gear > 0, b, jnp.conj(b)), 0.0)
+        b = jnp.where(bent, passed, b)
+        # Joints behind any other gear make up for nothing.
+        together, onward, total, longest = True, ratio[i], 0.0, 0.0
+        for r, after in zip(ratio[i + 1 :], lengths[i + 1 :], strict=True):
+            together &= (after == 0) | _is_unit(onward)
             total, longest = total + after * together, jnp.maximum(longest, after * together)
+            onward = r * jnp.where(after == 0, onward, 1.0)
         size = jnp.abs(b)
         distance, free = 2 * jnp.arctanh(size), 2 * jnp.arctanh(size) < _CANCELLED
         back = jnp.abs(distance - length)
@@ -280,7 +291,7 @@ def best_phases(beta: Components, phase: Components, ratio: Components) -> list[
         cosine = jnp.where(goal <= back, -1.0, jnp.clip(cosine, -1.0, 1.0))
         turned = (jnp.arccos(cosine) - jnp.angle(jnp.where(free, 1.0, b))) / 2
         phases.append(jnp.mod(jnp.where(free | (length == 0), p, turned), math.pi))
-        b = jnp.where(ratio[i] == 1, _moved(b, jnp.tan(beta[i] / 2) ** 2, phases[-1]), 0.0)
+        b, gear = _moved(b, jnp.tan(beta[i] / 2) ** 2, phases[-1]), ratio[i] * jnp.where(bent, 1.0, gear)
     return phases
 
 
@@ -316,7 +327,7 @@ PHASING = (
     Variable("speed_variation", "1", "speed of the rigid output, peak to peak over its mean", lower=0.0),
     Variable("angle_variation", "rad", "lead of the rigid output, peak to peak", lower=0.0),
     Variable("least_variation", "1", "speed_variation with the phases best_phase", lower=0.0),
-    Variable("best_phase", "rad", "phases that minimise speed_variation", ("joint",)),
+    Variable("best_phase", "rad", "phases that minimise speed_variation, of the joints at one speed", ("joint",)),
 )
 
 
@@ -329,7 +340,10 @@ def phasing_sentence(values: Values, parameters: Values) -> str:
     phases = ", ".join(f"{round(np.degrees(p), 2):.4g}" for p in values["best_phase"])
     best = f"with the phases [{phases}] deg by {round(100 * least, 9):.4g} %"
     if part - least <= 1e-9 * part + 1e-12:
-        best = "no phases make it less"
+        speeds = np.cumprod([1.0, *np.abs(parameters.get("ratio") or ())])
+        bent = [speed for speed, angle in zip(speeds, parameters["beta"], strict=False) if angle != 0] or [1.0]
+        which = "no phases" if max(bent) - min(bent) <= _WHOLE else "no phases of the joints at one speed"
+        best = f"{which} make it less"
     return f"The output speed varies by {round(100 * part, 9):.4g} % peak to peak ({degrees:.4g} deg{rpm}); {best}."
 
 
@@ -592,11 +606,14 @@ class Driveline(System):
 
     @serves("phasing", check=check, parameters=("beta", "phase", "ratio"), results=PHASING, says=phasing_sentence)
     def phasing(self) -> dict[str, Any]:
-        """Uneven rotation of the rigid output, and the phases that minimise it."""
+        """Uneven rotation of the rigid output, and the phases that minimise it among joints at one speed."""
         beta, phase, ratio = self.chain
         best = best_phases(beta, phase, ratio)
         variation, angle = uneven_rotation(beta, phase, ratio, self.half_turns())
         least, _ = uneven_rotation(beta, best, ratio, self.half_turns())
+        # Parts at different speeds, each made even as far as possible, may add up to more than before.
+        best = [jnp.where(least > variation, jnp.mod(p, math.pi), x) for p, x in zip(phase, best, strict=True)]
+        least = jnp.minimum(least, variation)
         return {"speed_variation": variation, "angle_variation": angle, "least_variation": least, "best_phase": best}
 
     @serves("modes", check=check, parameters=("k", "J", "ratio"))

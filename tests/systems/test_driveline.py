@@ -429,8 +429,32 @@ def test_phases_across_a_gear_make_up_for_nothing():
     alone = rotation(["20 deg"], [0.0])
     np.testing.assert_allclose(found.best_phase, [0.0, 0.3], rtol=1e-12)
     assert found.speed_variation == pytest.approx(found.least_variation, rel=1e-12)
+    assert found.sentence.endswith("no phases of the joints at one speed make it less.")
     # The first joint's speed, doubled, passes a joint of the double speed.
     assert alone.speed_variation < found.speed_variation < 2 * alone.speed_variation * 1.01
+
+
+@pytest.mark.parametrize(
+    ("beta", "ratio"),
+    [([0.2, 0.2], [-1, 1]), ([0.2, 0.0, 0.2], [2, 0.5, 1]), ([0.3, 0.0, 0.2, 0.4], [3, "-1/3", -1, 1])],
+)
+def test_gears_that_multiply_to_one_do_not_part_joints(beta, ratio):
+    """A reversed shaft turns the other way, unevenly by the same; the least is that of the joints without gears."""
+    phase = [0.0] * (len(beta) - 1) + [0.3]
+    found = rotation(beta, phase, ratio=ratio)
+    alone = rotation(beta, phase)
+    assert found.least_variation == pytest.approx(alone.least_variation, abs=1e-12)
+    assert rotation(beta, list(found.best_phase), ratio=ratio).speed_variation == pytest.approx(
+        found.least_variation, abs=1e-12
+    )
+
+
+def test_best_phases_of_joints_at_several_speeds_are_no_worse():
+    """Each part made even by itself would add up to .538."""
+    beta, phase = [0.57190071, 0.16340855, 0.53238915], [1.45645401, 1.01023857, 2.27633892]
+    found = rotation(beta, phase, ratio=[0.5, 1, 1])
+    assert found.speed_variation == pytest.approx(0.481553, rel=1e-6) and found.least_variation == found.speed_variation
+    np.testing.assert_allclose(found.best_phase, phase)
 
 
 @pytest.mark.full
