@@ -276,8 +276,9 @@ def _number_or_range(name: str, value: Any) -> Any:
         known = [end for end in ends if end is not None]
         # 1000-2000 is no number, and its second half no unit.
         if len(known) == len(ends) <= 2 and not any(re.match(r"[-.,\d]", unit) for _, unit in known):
-            # 0:18deg is a range in degrees.
-            units = [unit or known[-1][1] for _, unit in known]
+            # 0:18deg and 0deg:18 are ranges in degrees.
+            either = next((unit for _, unit in reversed(known) if unit), "")
+            units = [unit or either for _, unit in known]
             numbers = [f"{end!r} {unit}" if unit else end for (end, _), unit in zip(known, units, strict=True)]
             return numbers[0] if len(numbers) == 1 else tuple(numbers)
     elif isinstance(value, (int, float)) and not isinstance(value, bool):

@@ -242,18 +242,30 @@ def widest_angle(
 
 
 def speed_windows(
-    atlas: Atlas, system: type[System], at: Mapping[str, float], *, margin: float = 0.0, direct: Direct | None = None
+    atlas: Atlas,
+    system: type[System],
+    at: Mapping[str, float],
+    *,
+    margin: float = 0.0,
+    within: Range | None = None,
+    direct: Direct | None = None,
 ) -> Windows:
     """The stable ranges of the speed with the other parameters ``at``.
 
     Each is shortened by ``margin`` times the speed at both ends, except at the end of the atlas; empty ranges are left out.
+    Only what lies ``within`` a range is told, at the margin from boundaries beyond it, too.
     """
     part = _over(atlas, at, system.roles["speed"])
+    start, stop = within or (float(part.lower[0]), float(part.upper[0]))
     line = stability_along(part, system)
     criteria = Criteria.of(part, system)
     windows = []
     for interval in _stable_and_decided(line.intervals, line.undecided):
         low, high = _shortened(interval, part, margin)
+        if low < start:
+            low, interval = start, replace(interval, lower=start, lower_end=None)
+        if high > stop:
+            high, interval = stop, replace(interval, upper=stop, upper_end=None)
         if low >= high:
             continue
         values = np.linspace(low, high, DENSE)
@@ -262,7 +274,10 @@ def speed_windows(
         k = int(np.argmax(np.round(rho, 9)))
         check = direct and check_window((low, high), interval, line, criteria, direct)
         windows.append(Window(interval, (low, high), float(rho[k]), float(values[k]), check))
-    return Windows(tuple(windows), tuple(i for i in line.intervals if not i.stable), line.undecided)
+    unstable = [i for i in line.intervals if not i.stable and i.upper > start and i.lower < stop]
+    undecided = ((max(a, start), min(b, stop)) for a, b in line.undecided if b > start and a < stop)
+    clipped = (replace(i, lower=max(i.lower, start), upper=min(i.upper, stop)) for i in unstable)
+    return Windows(tuple(windows), tuple(clipped), tuple(undecided))
 
 
 def _over(atlas: Atlas, at: Mapping[str, float], *wanted: str) -> Atlas:

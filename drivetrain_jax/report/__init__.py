@@ -173,7 +173,7 @@ def _atlas_answers(
     if question is None:
         return [], drawn, False
     reply = question(atlas, {}, amplitude=amplitude, show=partial(_shown, atlas, convert(drawn)))
-    return reply.sentences(), drawn, bool(reply.data.get("forced"))
+    return reply.sentences(), drawn, "forced" in reply.data
 
 
 def _shown(atlas: StoredAtlas, drawn: xr.Dataset, name: str, value: float) -> tuple[str, float, str]:

@@ -374,7 +374,9 @@ def speed_windows(
     asked = replace(AtlasQuery.of(atlas, given, ranges=(), free=(speed,), within=(speed,)), show=show)
     panels = atlas.stability.atlas
     part = narrow(panels, {speed: asked.values[speed]}) if speed in asked.values else panels
-    answer = design.speed_windows(part, atlas.scene.system, asked.numbers(), margin=margin, direct=asked.direct)
+    answer = design.speed_windows(
+        panels, atlas.scene.system, asked.numbers(), margin=margin, within=asked.values.get(speed), direct=asked.direct
+    )
     names = [_resonance(asked, speed, interval) for interval in answer.unstable]
     compared, forced = forced_over(atlas, amplitude, [w.safe for w in answer.windows], asked.numbers(), asked.named)
     lines, sensitivities = [f"safe speeds, {asked.heading()}, margin {margin:g}"], []
@@ -417,7 +419,8 @@ def speed_windows(
         "proofs": proved,
         **forced,
     }
-    lines += [] if answer.windows else [f"  none {_OPEN if answer.undecided else 'within the atlas'}"]
+    where = _OPEN if answer.undecided else "with this margin" if margin else "within the atlas"
+    lines += [] if answer.windows else [f"  none {where}"]
     lines += [*_undecided(asked, speed, answer.undecided), *proofs]
     return Reply(lines, data, _where_unstable(asked, part, speed, answer, names))
 
@@ -430,7 +433,7 @@ def _where_unstable(
     ends = float(part.lower[k]), float(part.upper[k])
     if not answer.unstable:
         # Without a stable range nothing is decided.
-        word = "Stable" if answer.windows else "Undecided"
+        word = "Stable" if answer.windows or not answer.undecided else "Undecided"
         return f"{word} at {asked.span(speed, ends)}{_but_undecided(answer.undecided if answer.windows else ())}."
     label = asked.shown(speed, ends[0])[0]
     ranges = [
@@ -452,7 +455,14 @@ def _removed(asked: AtlasQuery, part: Atlas, speed: str, speeds: Range) -> str:
     answer = design.least_damping(part, system, speeds, others)
     if answer.value is None or not answer.certain:
         return ""
-    return f"; {asked.named(damping, _rounded(answer, 1.0))} or more removes this"
+    return f"; {asked.named(damping, _rounded(answer, 1.0))} or more{_end_of_atlas(asked, answer)} removes this"
+
+
+def _end_of_atlas(asked: AtlasQuery, answer: design.Answer) -> str:
+    """The end behind "or more" or "or less", beyond which the atlas does not tell; empty at 0."""
+    end = abs(answer.safe_end)
+    label, shown, _ = asked.shown(answer.parameter, end)
+    return "" if end in (0.0, answer.value) else f" (the atlas ends at {label} = {number(shown)})"
 
 
 def _rounded(answer: design.Answer, side: float) -> float:
@@ -578,7 +588,8 @@ def _extreme_sentence(safe: str, asked: AtlasQuery, answer: design.Answer) -> st
     label, speeds = asked.shown(name, answer.safe_end)[0], asked.span(speed, asked.values[speed])
     doubt = "" if answer.certain else " (not certain: some ranges are undecided)"
     if answer.value is not None:
-        return f"With {asked.named(name, _rounded(answer, side))} or {way}, {speeds} is stable{doubt}."
+        value = f"{asked.named(name, _rounded(answer, side))} or {way}{_end_of_atlas(asked, answer)}"
+        return f"With {value}, {speeds} is stable{doubt}."
     if not answer.stable:
         return f"{'No' if answer.certain else 'Perhaps no'} {label} of the atlas makes {speeds} stable."
     ranges = _and([asked.span(name, (i.lower, i.upper)) for i in answer.stable])

@@ -108,7 +108,9 @@ def with_boundaries(dataset: xr.Dataset, source: str | Path | xr.Dataset) -> xr.
     for name in plane:
         axis = dataset[swept[name].dims[0]]
         if axis.name != name:
-            size = axis.values[-1] / known[name][-1]
+            # The largest value, because one may be 0.
+            k = int(np.argmax(np.abs(known[name])))
+            size = axis.values[k] / known[name][k]
             dataset = _curves_in_physical_units(
                 dataset, name, axis.name, axis.attrs["units"], partial(np.multiply, size)
             )

@@ -314,7 +314,7 @@ def _least_stable(system: str, name: str, given: Mapping[str, Any], asked: Mappi
     unit = next((parts[1] for end in (low, high) if isinstance(end, str) and (parts := _units.split(end))), "")
     dataset, worst = with_unstable_ranges(dataset)
     units = units_of(dataset[name])
-    there: dict[str, Any] = {**asked, **given, name: f"{worst!r} {units}".removesuffix(" 1")}
+    there: dict[str, Any] = {**asked, **given, name: worst if units == "1" else f"{worst!r} {units}"}
     result = point(system, "floquet", **there)
     shown = in_units(dataset, [unit] if unit else [])
     span = runs_text(shown[name], [(float(shown[name].min()), float(shown[name].max()))])

@@ -457,7 +457,7 @@ def with_unstable_ranges(dataset: xr.Dataset) -> tuple[xr.Dataset, float]:
     outputs = ["spectral_radius", "verdict"]
 
     def size(x: np.ndarray) -> np.ndarray:
-        values = [f"{value!r} {units_of(axis)}".removesuffix(" 1") for value in x.tolist()]
+        values = x.tolist() if units_of(axis) == "1" else [f"{value!r} {units_of(axis)}" for value in x.tolist()]
         solved = run({**scene, "axes": {scene_key(axis): {"values": values}}, "outputs": outputs})
         radius, unstable = np.nan_to_num(solved["spectral_radius"].values), solved["verdict"].values == 1
         # Above 1 is what the verdict calls unstable.

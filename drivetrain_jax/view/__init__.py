@@ -56,10 +56,11 @@ def plot(dataset: xr.Dataset, *others: xr.Dataset) -> Figure:
         raise InputError(f"analysis = {analysis!r}: has no figure; expected one of {known}")
 
     from drivetrain_jax.view.charts import chart, prepare
-    from drivetrain_jax.view.style import STYLE
+    from drivetrain_jax.view.style import STYLE, alike
 
     with rc_context(STYLE):
-        datasets, figure = [prepare(one) for one in (dataset, *others)], None
+        first, figure = prepare(dataset), None
+        datasets = [first, *(alike(prepare(one), first) for one in others)]
         if record.figure:
             module, _, name = record.figure.partition(".")
             figure = getattr(import_module(f"drivetrain_jax.view.{module}"), name)(*datasets)

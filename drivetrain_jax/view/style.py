@@ -384,6 +384,18 @@ def allowed_units(units: Iterable[str]) -> str:
     return f"expected units of {', '.join(shown)}" if shown else "expected none, all values are dimensionless"
 
 
+def alike(dataset: xr.Dataset, first: xr.Dataset) -> xr.Dataset:
+    """``dataset`` in the units of ``first``, whose panels it shares: that of the same variable, else the first that fits."""
+    known = {name: str(variable.attrs.get("units", "1")) for name, variable in first.variables.items()}
+    changed = {}
+    for name, variable in dataset.variables.items():
+        units = str(variable.attrs.get("units", "1"))
+        factor, unit = suitable(units, [known[name]] if name in known else known.values())
+        if unit != units and variable.dtype.kind in "fc":
+            changed[name] = variable.dims, variable.values * factor, {**variable.attrs, "units": unit}
+    return _assigned(dataset, changed)
+
+
 def _assigned(dataset: xr.Dataset, changed: Mapping[Hashable, Any]) -> xr.Dataset:
     coords = {name: variable for name, variable in changed.items() if name in dataset.coords}
     return dataset.assign({n: v for n, v in changed.items() if n not in coords}).assign_coords(coords)

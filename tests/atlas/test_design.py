@@ -213,7 +213,8 @@ def test_stable_interval_away_from_an_unstable_safe_end(ask, ranges, fixed, spee
     assert answer.value is None and np.isnan(answer.error) and answer.certain and answer.safe_end == safe_end
     (interval,) = answer.stable
     assert (interval.lower, interval.upper) == pytest.approx(ends, abs=1e-8)
-    assert max(c.error for c in interval.crossings) < 1e-8
+    # The bound follows from an estimate, which rounding changes: 1.24e-8 on a processor with AVX2.
+    assert max(c.error for c in interval.crossings) < 2e-8
     omega, (low, high) = np.linspace(*speeds, 201), ends
 
     def largest(value):
@@ -253,6 +254,19 @@ def test_speed_windows_with_a_margin(atlas):
         assert window.largest < 1
     # Narrow windows vanish with a wide margin.
     assert len(speed_windows(atlas, CARDAN, {"beta": 1.0}, margin=0.1).windows) < len(windows)
+
+
+def test_a_margin_counts_from_boundaries_beyond_the_range(atlas):
+    whole = speed_windows(atlas, CARDAN, {"beta": 1.0})
+    low, high = max((w.safe for w in whole.windows[1:]), key=lambda ends: ends[1] / ends[0])
+    asked = {"margin": 0.05, "within": (1.01 * low, high)}
+    (window,) = speed_windows(atlas, CARDAN, {"beta": 1.0}, **asked).windows
+    assert window.safe == pytest.approx((1.05 * low, 0.95 * high), rel=1e-6)
+    near = speed_windows(atlas, CARDAN, {"beta": 1.0}, margin=0.05, within=(1.01 * low, 1.02 * low))
+    assert near.windows == near.unstable == near.undecided == ()
+    inside = speed_windows(atlas, CARDAN, {"beta": 1.0}, within=(0.9 * low, 1.02 * low))
+    assert inside.windows[-1].safe[1] == pytest.approx(1.02 * low) and inside.windows[-1].interval.upper_end is None
+    assert all(0.9 * low <= i.lower < i.upper <= low for i in inside.unstable)
 
 
 def test_an_undecided_range_is_no_safe_speed(atlas):

@@ -16,7 +16,7 @@ import pytest
 import xarray as xr
 
 from drivetrain_jax import ChunkError, InputError, __version__
-from drivetrain_jax.cli import _reading, main, quiet_hdf5
+from drivetrain_jax.cli import _number_or_range, _reading, main, quiet_hdf5
 from drivetrain_jax.runs.run import Progress, ProgressLine
 from drivetrain_jax.systems import get_system
 from tests.sizes import full_after
@@ -685,3 +685,8 @@ def test_a_reader_that_leaves_is_no_error():
     command = f"{sys.executable} -m drivetrain_jax.cli list cardan | true"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
     assert done.stderr == ""
+
+
+@pytest.mark.parametrize("text", ["1500rpm:2000", "1500:2000rpm", "1500rpm:2000rpm"])
+def test_a_range_has_one_unit(text):
+    assert _number_or_range("speed", text) == ("1500.0 rpm", "2000.0 rpm")

@@ -152,7 +152,7 @@ def test_the_damping_of_a_sentence_is_sufficient():
     atlas = dt.open_atlas(file)
     assert atlas_answers.speed_windows(atlas, {"c1": 0.3}).answer == (
         "Unstable at speed = 2270.71 to 2288.98 rpm (sum combination C+1) and 3126.26 to 3142.12 rpm (subharmonic S21); "
-        "c1 = 2.53436 N m s/rad (zeta = 0.00365803) or more removes this."
+        "c1 = 2.53436 N m s/rad (zeta = 0.00365803) or more (the atlas ends at c1 = 6.9282) removes this."
     )
     assert atlas_answers.speed_windows(atlas, {"c1": 2.53436}).answer == "Stable at speed = 2000 to 4000 rpm."
     # A chart along the speed has the same ranges, in its units.
@@ -162,7 +162,7 @@ def test_the_damping_of_a_sentence_is_sufficient():
     assert ranges.units == "rpm" and len(ranges)
     least = atlas_answers.least_damping(atlas, {"speed": (2000.0, 4000.0)})
     assert least.answer.startswith(
-        "With c1 = 2.53436 N m s/rad (zeta = 0.00365803) or more, speed = 2000 to 4000 rpm is"
+        "With c1 = 2.53436 N m s/rad (zeta = 0.00365803) or more (the atlas ends at c1 = 6.9282), speed = 2000 to"
     )
 
 
@@ -363,8 +363,10 @@ def test_an_answer_names_the_kinds_of_its_ends(speeds, kind, value):
     found = json.loads(reply.to_json())
     start, end = found["intervals"][0]["ends"]
     assert start == {"value": 0.0, "kind": "atlas", "error": None, "multiplier": None} and end["kind"] == kind
-    assert found["value"] == end["value"] == pytest.approx(value, abs=1e-7) and found["error"] == end["error"]
     decided = kind == "crossing"
+    # The edge of an undecided range moves with the estimated bound of the atlas, which rounding changes.
+    near = pytest.approx(value, abs=1e-7 if decided else 1e-6)
+    assert found["value"] == end["value"] == near and found["error"] == end["error"]
     assert found["certain"] == decided and found["check"]["agrees"]
     assert (end["multiplier"], found["limit"] is None) == (("-1", False) if decided else (None, True))
     if decided:

@@ -203,3 +203,11 @@ def test_one_entry_of_a_list_is_given_alone():
     for name, given, allowed in cases:
         with pytest.raises(dt.InputError, match=f"expected {allowed}"):
             dt.point("driveline", "phasing", **given, **{name: 0.3})
+
+
+@pytest.mark.full
+def test_a_range_of_a_number_without_unit():
+    found = dt.point("cardan", "floquet", beta=0.3, Omega=(1.3, 1.5), zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)
+    assert found.sentence.startswith(
+        "Unstable at Omega = 1.40025 to 1.43236 (S21); the rest of Omega = 1.3 to 1.5 is stable."
+    )

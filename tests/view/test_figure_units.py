@@ -9,7 +9,7 @@ import xarray as xr
 import drivetrain_jax as dt
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.datasets.figure import plot
-from drivetrain_jax.view.style import listed
+from drivetrain_jax.view.style import alike, listed
 from tests.view import results
 from tests.view.results import texts
 
@@ -152,3 +152,17 @@ def test_growth_at_a_speed_in_rpm_is_per_second():
     np.testing.assert_allclose(found[unstable], 2 * np.log(1.25) * hertz[unstable], rtol=1e-12)
     curve = plot(dataset.isel(beta=-1)).axes[0].lines[0].get_ydata()
     np.testing.assert_allclose(curve[unstable[-1]], (2 * np.log(1.25) * hertz)[-1][unstable[-1]], rtol=1e-12)
+
+
+def test_results_on_shared_axes_have_the_units_of_the_first():
+    """Prefixes follow the values of each result, and axes the text of each scene."""
+
+    def result(unit, axis, values):
+        x = ("x", np.array([1.0, 2.0]), {"units": axis})
+        return xr.Dataset({"u": ("x", np.array(values), {"units": unit}), "v": ("x", np.array(values))}, {"x": x})
+
+    first, second = result("um", "rpm", [1.0, 2.0]), result("mm", "Hz", [0.5, 3.0])
+    shown = alike(second, first)
+    assert shown.u.values.tolist() == [500.0, 3000.0] and shown.x.values.tolist() == [60.0, 120.0]
+    assert (shown.u.attrs["units"], shown.x.attrs["units"]) == ("um", "rpm")
+    xr.testing.assert_identical(shown.v.drop_vars("x"), second.v.drop_vars("x"))
