@@ -341,7 +341,8 @@ def phasing_sentence(values: Values, parameters: Values) -> str:
     best = f"with the phases [{phases}] deg by {round(100 * least, 9):.4g} %"
     if part - least <= 1e-9 * part + 1e-12:
         speeds = np.cumprod([1.0, *np.abs(parameters.get("ratio") or ())])
-        bent = [speed for speed, angle in zip(speeds, parameters["beta"], strict=False) if angle != 0] or [1.0]
+        angles = parameters.get("beta") or ()
+        bent = [speed for speed, angle in zip(speeds, angles, strict=False) if angle != 0] or [1.0]
         which = "no phases" if max(bent) - min(bent) <= _WHOLE else "no phases of the joints at one speed"
         best = f"{which} make it less"
     return f"The output speed varies by {round(100 * part, 9):.4g} % peak to peak ({degrees:.4g} deg{rpm}); {best}."
