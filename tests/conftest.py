@@ -10,6 +10,7 @@ import gc
 import os
 import resource
 import shutil
+import statistics
 import sys
 import time
 from pathlib import Path
@@ -17,10 +18,12 @@ from pathlib import Path
 import pytest
 
 # Limits in reference seconds: of one test that is not marked `full`, and of a whole run of `make test` and `make validate`.
-# The unit differs by 20 % between machines, and by 8 % between runs: one commit measured 963 and 1,044 on one machine.
+# The unit is measured all along: computations take up to twice the CPU time while another one runs beside them.
 LONGEST, TOTAL = 5.0, {"not full and not docs": 1200.0, "full": 9000.0}
 # CPU seconds of `reference` on the machine that the limits refer to: there the tests of d7ff433 took 2,300 s.
 REFERENCE = 0.081
+# Seconds between two measurements of it.
+BETWEEN = 15.0
 # Growth that a compilation leaves behind, and resident memory above which compiled code is dropped, in bytes.
 GROWTH, LIMIT = 200 << 20, 1280 << 20
 # Size of the cache of compiled code at which it begins anew, in bytes.
@@ -64,11 +67,6 @@ def reference() -> float:
     return time.process_time() - begin
 
 
-def unit() -> float:
-    """CPU seconds of this process in a reference second."""
-    return min(reference() for _ in range(3)) / REFERENCE
-
-
 def cpu(who: int) -> float:
     used = resource.getrusage(who)
     return used.ru_utime + used.ru_stime
@@ -81,9 +79,17 @@ class Budget:
     """
 
     def __init__(self, config: pytest.Config):
-        self.unit = unit()
         self.total, self.limit = 0.0, TOTAL.get(config.getoption("markexpr"))
+        # CPU seconds of this process in a reference second, and the time of the last measurement.
+        self.units: list[float] = []
+        self.last = -BETWEEN
         self.spans: list[tuple[float, float]] = []
+
+    def measure(self) -> None:
+        """Measure the unit again if the last time was long ago."""
+        if time.monotonic() > self.last + BETWEEN:
+            self.units.append(reference() / REFERENCE)
+            self.last = time.monotonic()
 
     def heard(self, event: str, seconds: float, **_: object) -> None:
         """Note the wall time of a trace or compilation, which includes those within it."""
@@ -97,12 +103,14 @@ class Budget:
         if (jax := sys.modules.get("jax")) and not self.spans:
             jax.monitoring.register_event_duration_secs_listener(self.heard)
             self.spans.append((0.0, 0.0))
+        self.measure()
         begin, own, children = time.monotonic(), cpu(resource.RUSAGE_SELF), cpu(resource.RUSAGE_CHILDREN)
         result = yield
         wall = max(time.monotonic() - begin, 1e-9)
         compiling = sum(end - start for start, end in self.spans if start >= begin)
         seconds = (cpu(resource.RUSAGE_SELF) - own) * max(1 - compiling / wall, 0)
-        seconds = (seconds + cpu(resource.RUSAGE_CHILDREN) - children) / self.unit
+        self.measure()
+        seconds = (seconds + cpu(resource.RUSAGE_CHILDREN) - children) / statistics.median(self.units[-5:])
         if seconds > LONGEST and not any(item.get_closest_marker(name) for name in ("full", "docs")):
             pytest.fail(
                 f"{seconds:.1f} reference seconds, expected at most {LONGEST}: shorten or mark full", pytrace=False
@@ -118,10 +126,10 @@ class Budget:
 
     @pytest.hookimpl(trylast=True)
     def pytest_sessionfinish(self, session):
-        self.unit = (self.unit + unit()) / 2
+        self.measure()
         # Workers count themselves; to the process that starts them they are children.
         alone = not session.config.getoption("numprocesses", None)
-        self.total += (cpu(resource.RUSAGE_SELF) + alone * cpu(resource.RUSAGE_CHILDREN)) / self.unit
+        self.total += (cpu(resource.RUSAGE_SELF) + alone * cpu(resource.RUSAGE_CHILDREN)) / statistics.mean(self.units)
         if hasattr(session.config, "workerinput"):
             session.config.workeroutput["reference_seconds"] = self.total
         elif self.limit and self.total > self.limit:

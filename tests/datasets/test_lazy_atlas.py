@@ -14,7 +14,6 @@ import pytest
 import xarray as xr
 
 import drivetrain_jax as dt
-from drivetrain_jax.atlas import charts
 from drivetrain_jax.datasets.engine import gap
 from drivetrain_jax.runs import through_atlas
 from drivetrain_jax.runs.atlas_file import StoredAtlas
@@ -175,22 +174,13 @@ def test_chunks_of_even_axes_reach_along_those_of_low_degree(deep):
 
 
 @pytest.mark.full
-def test_many_small_rectangles_are_evaluated_together(deep, monkeypatch):
-    """With the numbers of single points, also where eigenvalues decide."""
-    stability, calls = dt.open_atlas(deep).stability, []
-    evaluated_tiles = charts.evaluated_tiles
-
-    def counting(tiles, *more):
-        calls.append(tiles := list(tiles))
-        return evaluated_tiles(iter(tiles), *more)
-
-    monkeypatch.setattr(charts, "evaluated_tiles", counting)
+def test_small_rectangles_have_the_numbers_of_single_points(deep):
+    """Also where eigenvalues decide."""
+    stability = dt.open_atlas(deep).stability
     axes = [
         np.linspace(*ends, n) for ends, n in zip(((0.0, 0.6), (1.38, 1.46), (0.95, 1.05)), (20, 40, 33), strict=True)
     ]
     found = stability.on_grid(axes)
-    (tiles,) = calls
-    assert len(tiles) < 20 * len(stability.atlas.panels) / 2 and max(len(tile.index[0]) for tile in tiles) > 1
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     alone = stability.at(points)
     error = found["spectral_radius_error"].ravel() + alone["spectral_radius_error"]
