@@ -25,7 +25,7 @@ from drivetrain_jax.analysis.floquet import quartic
 from drivetrain_jax.analysis.floquet.results import VARIABLES
 from drivetrain_jax.atlas import charts, evaluation
 from drivetrain_jax.atlas.panels import Atlas, Panel
-from tests.oracles.atlas_direct import BASE, cardan_atlas, direct_radius, random_points
+from tests.oracles.atlas_direct import BASE, cardan_atlas, direct_radius, propagators, random_points, solves
 
 COUNTS = [f"{what}_{by}" for what in ("violations", "wrong") for by in ("direct", "precise")]
 
@@ -367,3 +367,18 @@ def test_a_slice_of_four_parameters():
     chart = atlas.slice({"mu": 3.0, "alpha": 2.0})
     columns = np.column_stack([points[:, :2], np.full((3000, 2), [3.0, 2.0])])
     assert chart.at(points[:, :2])["spectral_radius"] == pytest.approx(direct_radius(atlas, columns)[0], rel=1e-6)
+
+
+def test_bounds_of_solves_hold_where_modes_fade_within_panels():
+    """There Gauss collocation has a lower order: the bounds were up to 36 times too small."""
+    columns = {
+        "beta": np.array([1.4742, 1.4939, 1.4607]),
+        "Omega": np.array([0.2042, 0.4727, 0.3278]),
+        "zeta": np.array([0.2981, 0.2966, 0.2841]),
+        "alpha": np.array([14.8217, 16.0626, 19.7437]),
+        "mu": np.array([1.5675, 2.9674, 0.1117]),
+        "gamma": np.array([71.2515, 8.5106, 55.7795]),
+    }
+    exact, found = propagators(columns, 1e-14), solves(columns, 1e-8)
+    error, bound = (np.linalg.norm(x, axis=1) for x in (found[:, :16] - exact, found[:, 16:]))
+    assert (error < bound).all() and (bound < 1e-9 * np.linalg.norm(exact, axis=1)).all()
