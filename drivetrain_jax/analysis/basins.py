@@ -50,6 +50,8 @@ OPTIONS = (
 )
 # Relative difference of extremes below which two motions are the same.
 _SAME = 1e-6
+# Displacement that is rounding of the rest in the middle of the play, over half the backlash.
+_REST = 1e-14
 _TOLERANCE = 1e-10
 _CHUNK = 8
 
@@ -69,14 +71,15 @@ def _solve(
     flat = jax.tree.map(lambda x: x[:, 0], motions)
     motion = describe(take(model, route), flat, rtol=_TOLERANCE, integrals=False)
     kept = ("u_max", "u_min", "period_multiple", "outcome")
-    results = shares(*(motion[name].reshape(points, samples).T for name in kept))
+    rest = _REST * jnp.broadcast_to(jnp.asarray(model.b, float), shape).reshape(points)
+    results = shares(*(motion[name].reshape(points, samples).T for name in kept), rest=rest)
     return {name: results[name].reshape(*results[name].shape[:-1], *shape) for name in (*request.outputs, "outcome")}
 
 
-def shares(high: Array, low: Array, multiple: Array, outcome: Array) -> dict[str, Array]:
+def shares(high: Array, low: Array, multiple: Array, outcome: Array, rest: Array | float = 0.0) -> dict[str, Array]:
     """Attractors and their shares, shape ``(8, N)``, by falling ``attractor_u_max``, from motions ``(samples, N)``.
 
-    Each attractor is represented by the first motion not yet counted.
+    Each attractor is represented by the first motion not yet counted. Motions within ``rest`` (N,) are at rest.
     """
     count = high.shape[0]
     periodic = multiple > 0
@@ -90,7 +93,7 @@ def shares(high: Array, low: Array, multiple: Array, outcome: Array) -> dict[str
         first = jnp.argmax(left, axis=0)[None]
         top, bottom, m = (jnp.take_along_axis(x, first, axis=0) for x in (high, low, multiple))
         size = jnp.maximum(jnp.abs(top), jnp.abs(bottom))
-        near = jnp.maximum(jnp.abs(high - top), jnp.abs(low - bottom)) <= _SAME * size
+        near = jnp.maximum(jnp.abs(high - top), jnp.abs(low - bottom)) <= jnp.maximum(_SAME * size, rest)
         same = left & (multiple == m) & (near | ~periodic)
         return left & ~same, (same.sum(axis=0), top[0], bottom[0], m[0])
 

@@ -28,6 +28,8 @@ from drivetrain_jax.systems import DrivenSprings, System
 
 # Points of a chunk; their responses at all frequencies are in memory at the same time.
 _CHUNK = 16
+# Sum of the forces on a rigid mode, relative to their moduli, up to which they balance.
+_BALANCED = 1e-12
 
 
 def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
@@ -36,11 +38,15 @@ def _solve(system: type[System], request: Request, values: Mapping[str, Any], ef
     modes = system_modes(model.springs, "auto", lanes)
     weight = 1 / jnp.sqrt(_in_lanes(model.springs.mass, lanes))
     shapes = weight[:, None] * modes.vectors  # pyright: ignore[reportOperatorIssue]
-    driven = jnp.sum(shapes * _in_lanes(model.force, lanes)[:, None], axis=0)
-    # The computed frequency of a rigid mode is rounding.
-    natural = jnp.where(is_rigid(modes.frequency, largest_frequency(model.springs, lanes)), 0.0, modes.frequency)
+    work = shapes * _in_lanes(model.force, lanes)[:, None]
+    driven = jnp.sum(work, axis=0)
+    # The computed frequency of a rigid mode is rounding, and so is what internal forces leave to drive it.
+    rigid = is_rigid(modes.frequency, largest_frequency(model.springs, lanes))
+    natural = jnp.where(rigid, 0.0, modes.frequency)
+    driven = jnp.where(rigid & (jnp.abs(driven) <= _BALANCED * jnp.sum(jnp.abs(work), axis=0)), 0.0, driven)
     omega = 2 * math.pi * jnp.asarray(_frequencies(request))[:, None, None]
-    gain = driven / (natural**2 - omega**2 + 2j * damping * natural * omega)
+    # A mode that is not driven stays at rest, also a rigid one at the frequency 0.
+    gain = jnp.where(driven == 0, 0.0, driven / (natural**2 - omega**2 + 2j * damping * natural * omega))
     response = jnp.einsum("dnl,fnl->fdl", shapes, gain)
     finite = jnp.isfinite(response)
     polar = {"amplitude": jnp.abs(response), "phase": jnp.angle(response)}

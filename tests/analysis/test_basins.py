@@ -86,6 +86,13 @@ def test_non_periodic_motions_alone_are_one_attractor():
     assert found["unsettled_fraction"] == 0 and found["outcome"] == Outcome.SUCCESS
 
 
+def test_roundings_of_one_rest_are_one_attractor():
+    high, zeros = jnp.array([[0.0], [5e-33], [-2e-33], [0.3]]), jnp.zeros((4, 1), int)
+    apart, together = (shares(high, -high, zeros + 1, zeros, rest)["basin_fraction"][:, 0] for rest in (0.0, 1e-15))
+    assert not jnp.isnan(apart[3])
+    np.testing.assert_array_equal(together, [0.25, 0.75] + [np.nan] * 6)
+
+
 @pytest.mark.full
 def test_gears_at_rest_are_one_attractor():
     """Without a drive amplitude all motions come to rest, at any frequency."""

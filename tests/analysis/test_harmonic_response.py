@@ -83,6 +83,16 @@ def test_an_undamped_free_gear_has_no_amplitude_at_rest():
 
 
 @pytest.mark.full
+def test_slow_errors_of_meshes_do_not_turn_a_free_gear():
+    """Far below the first elastic mode, at 727 Hz, the response is that at rest; inner forces leave the rigid mode alone."""
+    still, slow, at_rest = (
+        dt.harmonic_response(dt.Planetary(), start=f, stop=2 * f + 1e-9, num=2).amplitude[0] for f in (1.0, 1e-4, 0.0)
+    )
+    np.testing.assert_allclose(slow, still, rtol=1e-4, atol=1e-11)
+    np.testing.assert_allclose(at_rest, slow, rtol=1e-6, atol=1e-11)
+
+
+@pytest.mark.full
 def test_a_batch_equals_its_points():
     sizes = jnp.array([1e-6, 2e-6, 5e-6])
     options = {"start": 100.0, "stop": 3e3, "num": 20}

@@ -613,3 +613,15 @@ def test_a_tripod_shaft_without_torque_comes_to_rest():
     )
     assert ours.verdict.values.tolist() == [Verdict.FIXED_POINT, Verdict.PARAMETRICALLY_UNSTABLE]
     assert (ours.lyapunov_standard_error < 1e-5).all()
+
+
+@pytest.mark.full
+def test_small_multipliers_of_an_orbit_with_a_long_period():
+    """Over 6,133 strobes tangent vectors shrink to exp(-740): of one parametric equation, by SciPy over one strobe."""
+    damping = [0.04, 0.08]
+    points = {"zeta": damping, "chi_n": [0.02] * 2, "M_AEM": [2550.0] * 2, "excitation_frequency": [3066.5] * 2}
+    outputs = ["lyapunov_spectrum", "lyapunov_standard_error"]
+    found = dt.run({"system": "tripod", "analysis": "lyapunov", "points": points, "outputs": outputs,
+                    "fixed": {"element": "input", "beta": 0.157, "phi0": 0.0}, "options": {"max_time": 0.4}})  # fmt: skip
+    np.testing.assert_allclose(found.lyapunov_spectrum[:, 0], [-369.91787, -770.60015], rtol=1e-6)
+    assert (found.lyapunov_standard_error[:, 0] < 1e-9).all()

@@ -54,6 +54,24 @@ def test_folds_and_doublings_of_a_map():
     assert np.isnan(shifted[0][:, 1:]).all() and shifted[1].all()
 
 
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("beta", "zeta", "expected"),
+    [
+        (0.05, 1e-5, [1.415542246836, 1.416426686514]),
+        (0.02, 1e-5, [1.415916730317, 1.416052539991]),
+        (0.1, 1e-4, [1.414220311353, 1.417743392982]),
+    ],
+)
+def test_doublings_of_a_narrow_tongue_are_found(beta, zeta, expected):
+    """Where ``floquet`` of the equilibrium has its edges, to the small motion about it."""
+    fixed = {"beta": beta, "zeta": zeta, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+    axes = {"Omega": {"start": 1.35, "stop": 1.5, "num": 4}}
+    found = dt.run({"system": "cardan", "analysis": "frequency_response", "axes": axes, "fixed": fixed})
+    np.testing.assert_allclose(found.doubling_frequency[0, :2], expected, rtol=1e-9)
+    assert (found.outcome == 0).all()
+
+
 def test_determinants_are_those_of_numpy():
     a = np.random.default_rng(0).standard_normal((5, 5, 3))
     np.testing.assert_allclose(determinant(jnp.asarray(a)), np.linalg.det(np.moveaxis(a, -1, 0)), rtol=1e-12)

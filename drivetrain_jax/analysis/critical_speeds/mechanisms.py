@@ -7,6 +7,8 @@ mass, whatever the other parameters. They are combinations of ``1``, ``x`` and, 
 
 from __future__ import annotations
 
+from functools import reduce
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -72,13 +74,15 @@ def _slow_modes(shaft: Shaft) -> Array:
 
 
 def is_undefined(shaft: Shaft) -> Array:
-    """True if a mechanism moves no mass, or a segment has rotary inertia without mass: no frequency is defined then.
+    """True if a mechanism moves no mass, a segment has rotary inertia without mass, or a number is missing: no frequency is
+    defined then.
 
     Such a mechanism remains where everything that has mass is held. Shape of the lanes.
     """
     if shaft.k_y is not None:
         first, second = (is_undefined(plane) for plane in _in_planes(shaft))
         return first | second
+    missing = [jnp.any(jnp.isnan(field), axis=0) for field in shaft if field is not None]
     shaft = shaft.spread()
     massive, (held, turning) = shaft.rhoA > 0, _springs(shaft)
     none = jnp.zeros_like(massive[:1])
@@ -88,6 +92,7 @@ def is_undefined(shaft: Shaft) -> Array:
     if shaft.inertia is not None:
         turning = turning | (shaft.inertia != 0)
     weightless = _number(_unrestrained(shaft, _motions_at_nodes(shaft)[1], deflection, turning)) > 0
+    weightless = reduce(jnp.logical_or, missing, weightless)
     return weightless if shaft.rhoI is None else weightless | jnp.any(~massive & (shaft.rhoI > 0), axis=0)
 
 

@@ -47,7 +47,7 @@ from drivetrain_jax.systems import ForcedModel, PiecewiseLinearOscillator, Syste
 
 _MOST_ORBITS, _MOST_SPECIAL = 7, 16
 # Ratio of neighbouring starts, most starts, steps of each branch, its longest step, and the tolerance of its integrations.
-_SPACING, _STARTS, _ATTEMPTS, _LONGEST, _RTOL = 1.15, 48, 150, 0.06, 1e-9
+_SPACING, _STARTS, _ATTEMPTS, _LONGEST, _RTOL = 1.15, 48, 400, 0.06, 1e-9
 # Positions of one branch at a speed, folds and doublings of each kind on one branch, most steps of an integration.
 _EACH, _EACH_SPECIAL, _STEPS = 3, 4, 4096
 

@@ -20,7 +20,7 @@ from drivetrain_jax.analysis.impacts.piecewise_march import (
     Here,
     Lanes,
     Motion,
-    advance,
+    advanced_once,
     allowed_steps,
     certain_span,
     derivatives,
@@ -133,7 +133,7 @@ def _watched(lanes: Lanes, motion: Motion, so_far: Measures, integrals: bool) ->
     d = jnp.maximum(d, least_step(lanes, here, motion, rate))
     # The ends of steps do not affect the measures and are not differentiated, except for the end of the period.
     d = jnp.where(d >= rest, rest, jax.lax.stop_gradient(d))
-    moved = advance(lanes, here, motion, d)
+    moved = advanced_once(lanes, here, motion, d)
     # An impact counts where a step begins beyond the flank. Compiled code may round the end of a step differently in two
     # uses, so that a count at the end of steps would miss impacts or count them twice.
     before, last = here.side, so_far.side

@@ -334,6 +334,15 @@ def advance(lanes: Lanes, here: Here, motion: Motion, d: Array) -> Motion:
     return Motion(time, cosine, sine, u, v, matrix, motion.left - ends, motion.steps + 1)
 
 
+def advanced_once(lanes: Lanes, here: Here, motion: Motion, d: Array) -> Motion:
+    """:func:`advance`, with one rounding of the displacement where the damping jumps.
+
+    Compiled code may round a displacement on a flank differently in its two uses: in the factor of the jump, and as the
+    start of the next step, which would then apply the factor once more.
+    """
+    return (advance if lanes.jump is None else stored(advance))(lanes, here, motion, d)
+
+
 def likely_span(here: Here) -> Array:
     """First guess of the length of a step: a large part of an oscillation of the region."""
     return _LIKELY_ARC / jnp.maximum(here.region.rate, 1e-300)
@@ -376,7 +385,7 @@ def next_step(lanes: Lanes, here: Here, motion: Motion) -> Array:
 def step(lanes: Lanes, motion: Motion) -> Motion:
     """``motion`` after one step in the finite lanes with remaining periods."""
     here = locate(lanes, motion.u)
-    moved = advance(lanes, here, motion, next_step(lanes, here, motion))
+    moved = advanced_once(lanes, here, motion, next_step(lanes, here, motion))
     active = (motion.left > 0) & jnp.isfinite(motion.u)
     return jax.tree.map(lambda new, old: jnp.where(active, new, old), moved, motion)
 

@@ -83,6 +83,8 @@ _SAME = 10.0
 # Target of the exponents' errors, relative to the largest exponent; part of a change by twice the steps that remains (1/512
 # by the order of the scheme); roundings in a multiplier.
 _TARGET, _REMAINS, _ROUNDINGS = 1e-10, 1 / 32, 16 * _EPS
+# Size below which tangent vectors are lengthened.
+_LOW = 1e-100
 # Limits of the iteration: corrections, and steps.
 _CORRECTIONS, _WORK = 16, 2e6
 
@@ -102,13 +104,14 @@ class Orbit(NamedTuple):
 
 
 class _Turn(NamedTuple):
-    """The map over a period: the end, its derivative by the start, the integral of the divergence, and the first strobe that
-    equals the start (0: none)."""
+    """The map over a period: the end, its derivative by the start over ``exp(shift)``, the integral of the divergence, the
+    first strobe that equals the start (0: none), and ``shift``."""
 
     end: Array
     matrix: Array
     contraction: Array
     back: Array
+    shift: Array
 
 
 class _Search(NamedTuple):
@@ -204,7 +207,8 @@ def _newton(flow: Flow, steps: Any, state: Vector, strobe: Array, multiple: Arra
         length = jnp.where(moving, multiple, 0)
         turn = _turn(flow, s.steps, s.state, strobe, length, scale)
         eye = jnp.eye(flow.size).reshape(flow.size, flow.size, *(1,) * len(shape))
-        delta = solve(eye - turn.matrix, _difference(flow, turn.end, s.state)[:, None])[:, 0]
+        matrix = turn.matrix * jnp.exp(turn.shift)
+        delta = solve(eye - matrix, _difference(flow, turn.end, s.state)[:, None])[:, 0]
         change = _size(delta)
         settled = moving & (change <= _CLOSE * jnp.maximum(scale, _size(s.state)))
         failed = moving & ~settled & ~(change <= s.change / 2)
@@ -212,7 +216,7 @@ def _newton(flow: Flow, steps: Any, state: Vector, strobe: Array, multiple: Arra
         exponents, rounding = _exponents(turn, period, multiple)
         errors = _REMAINS * abs(exponents - s.exponents) + rounding
         done = settled & jnp.all(errors <= _TARGET * jnp.max(abs(exponents), axis=0) + 2 * rounding, axis=0)
-        belongs = _belongs(flow, (start, first, s.state + delta), turn.matrix, exponents[0] * period)
+        belongs = _belongs(flow, (start, first, s.state + delta), matrix, exponents[0] * period)
         belongs = jnp.where(jnp.isinf(s.exponents[0]), belongs, s.belongs)
         active = s.active & ~failed & ~done
         refined = jnp.all(s.settled | settled | ~active)
@@ -228,7 +232,7 @@ def _newton(flow: Flow, steps: Any, state: Vector, strobe: Array, multiple: Arra
         return jnp.any(s.active) & (s.correction < _CORRECTIONS) & (s.work < _WORK)
 
     unknown = jnp.full(start.shape, jnp.inf)
-    nothing = _Turn(start, jnp.zeros((flow.size, *start.shape)), unknown[0], multiple)
+    nothing = _Turn(start, jnp.zeros((flow.size, *start.shape)), unknown[0], multiple, jnp.zeros(shape))
     s = jax.lax.while_loop(unfinished, correct, _Search(
         jnp.int64(0), jnp.float64(0), jnp.maximum(jnp.asarray(steps) // 2, 1), start, unknown[0], multiple > 0,
         jnp.zeros(shape, bool), start, jnp.zeros(shape, bool), nothing, unknown, unknown,
@@ -258,22 +262,25 @@ def _turn(flow: Flow, steps: Any, start: Array, strobe: Array, length: Array, sc
     n, shape = flow.size, start.shape[1:]
     advance = strobe_map(flow, steps)
 
-    def march(longest: Array, frame: Frame, strobe: Array, length: Array, scale: Array) -> tuple[Frame, Array]:
+    def march(longest: Array, frame: Frame, strobe: Array, length: Array, scale: Array) -> tuple[Frame, Array, Array]:
         first = frame.state
         least = jnp.maximum(_CLOSE * _size(first), _ZERO * scale)
 
-        def body(k: Array, carry: tuple[Frame, Array]) -> tuple[Frame, Array]:
-            frame, back = carry
+        def body(k: Array, carry: tuple[Frame, Array, Array]) -> tuple[Frame, Array, Array]:
+            frame, back, shift = carry
             new = jax.tree.map(lambda a, b: jnp.where(k < length, a, b), advance(strobe + k, frame), frame)
             equal = _size(_difference(flow, new.state, first)) <= least
-            return new, jnp.where((back == 0) & equal, k + 1, back)
+            # Over a long period tangent vectors may fall below the smallest number.
+            low = reduce(jnp.maximum, [abs(x[i]) for x in new.tangents for i in range(n)]) < _LOW
+            new = new._replace(tangents=tuple(jnp.where(low, x / _LOW, x) for x in new.tangents))
+            return new, jnp.where((back == 0) & equal, k + 1, back), shift + jnp.where(low, math.log(_LOW), 0.0)
 
-        return jax.lax.fori_loop(0, longest, body, (frame, jnp.zeros_like(length)))
+        return jax.lax.fori_loop(0, longest, body, (frame, jnp.zeros_like(length), jnp.zeros(shape)))
 
     units = (jnp.broadcast_to(u.reshape(n, *(1,) * len(shape)), (n, *shape)) for u in jnp.eye(n))
     frame = Frame(tuple(start), tuple(units), jnp.zeros(shape))
-    frame, back = one_kernel(flow)(march)(jnp.max(length), frame, strobe, length, scale)
-    return _Turn(jnp.stack(frame.state), jnp.stack(frame.tangents), frame.contraction, back)
+    frame, back, shift = one_kernel(flow)(march)(jnp.max(length), frame, strobe, length, scale)
+    return _Turn(jnp.stack(frame.state), jnp.stack(frame.tangents), frame.contraction, back, shift)
 
 
 def _exponents(turn: _Turn, period: Array, multiple: Array) -> tuple[Array, Array]:
@@ -293,7 +300,9 @@ def _exponents(turn: _Turn, period: Array, multiple: Array) -> tuple[Array, Arra
     slope = jnp.maximum(jnp.prod(jnp.where(eye > 0, 1.0, gaps), axis=1), jnp.sqrt(change / beside))
     errors = change / jnp.where(beside > 0, slope, 1.0) / modulus / period
     order = jnp.argsort(-modulus, axis=0)
-    exponents, errors = (jnp.take_along_axis(x, order, axis=0) for x in (jnp.log(modulus) / period, errors))
+    exponents, errors = (
+        jnp.take_along_axis(x, order, axis=0) for x in ((jnp.log(modulus) + turn.shift) / period, errors)
+    )
     rest, uncertain = turn.contraction / period - jnp.sum(exponents[:-1], axis=0), jnp.sum(errors[:-1], axis=0)
     small = _TARGET * jnp.max(abs(exponents), axis=0)
     hidden = (errors[-1] > jnp.maximum(uncertain, small)) | ~(abs(rest - exponents[-1]) <= small)

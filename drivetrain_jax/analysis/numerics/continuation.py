@@ -28,11 +28,13 @@ _ASIDE = 1 / 3
 # Limits so that no pair of folds or doublings hides between two points: largest deviation of a test value (``det(1 -+ M)``)
 # from the line through the last two points, relative to the value; least such value; fraction of the longest step up to
 # which steps are always accepted.
-_BENT, _LEAST_DISTANCE, _FINE = 0.25, 0.02, 0.01
+_BENT, _LEAST_DISTANCE, _FINE = 0.25, 1e-5, 1e-3
 # Most steps of all motions of a branch.
 _BUDGET = 5e6
 # Locating a fold or doubling: most steps, and size of the last step relative to the chord.
 _ROOT_STEPS, _LOCATED = 40, 1e-13
+# Least unit of a component of the state there, relative to the largest: one that vanishes by symmetry has no digits.
+_LEAST_UNIT = 1e-3
 # Relative difference below which folds or doublings are the same.
 _SAME = 1e-8
 
@@ -214,6 +216,7 @@ def locate(period_map: PeriodMap, ends: tuple[Array, Array], tests: tuple[Array,
     """
     chord = ends[1] - ends[0]
     scale = jnp.abs(ends[0]) + jnp.abs(ends[1])
+    scale = scale.at[:-1].set(jnp.maximum(scale[:-1], _LEAST_UNIT * jnp.max(scale[:-1], axis=0)))
     normal = chord / scale
     span = jnp.sum(normal**2, axis=0)
 
