@@ -198,8 +198,7 @@ def _pure(job: _Job) -> Callable[[Any], dict[str, Array]]:
     @solve.defjvp
     def _(primals: tuple[Any], tangents: tuple[Any]) -> tuple[dict[str, Array], dict[str, Any]]:
         (parameters,), (directions,) = primals, tangents
-        if job.analysis.once:
-            parameters = _once(job.analysis.once)(parameters)
+        parameters = _once(job.analysis.name)(parameters)
         outputs = tuple(dict.fromkeys((*job.request.outputs, *job.analysis.derivative_outputs(job.request.outputs))))
         wider = job if outputs == job.request.outputs else replace(job, request=replace(job.request, outputs=outputs))
         results = _pure(wider)(parameters)
@@ -213,8 +212,8 @@ def _pure(job: _Job) -> Callable[[Any], dict[str, Array]]:
 
 
 @cache
-def _once(message: str) -> Callable[[Any], Any]:
-    """The identity, whose derivative is an error."""
+def _once(name: str) -> Callable[[Any], Any]:
+    """The identity, whose derivative is an error: only first derivatives of the analysis ``name`` are known."""
 
     @jax.custom_jvp
     def same(parameters: Any) -> Any:
@@ -222,7 +221,7 @@ def _once(message: str) -> Callable[[Any], Any]:
 
     @same.defjvp
     def _(primals: Any, tangents: Any) -> Any:
-        raise InputError(message)
+        raise InputError(f"{name}: got a second derivative, expected a first; take differences of the gradient")
 
     return same
 
@@ -275,11 +274,10 @@ def _tangents(results: dict[str, Array], jacobians: dict[str, Array], directions
     direction = jnp.stack(directions)
 
     def tangent(name: str, result: Array) -> Array:
-        if name in jacobians:
-            jacobian = jnp.asarray(jacobians[name], result.dtype).reshape(result.size, direction.size)
-            return jnp.sum(scaled(jacobian, direction.astype(result.dtype)), axis=1).reshape(result.shape)
         unknown = 0.0 if name.endswith(("_error", "_residual")) else jnp.nan
-        return jnp.full(result.shape, unknown, result.dtype) * jnp.sum(direction)
+        jacobian = jacobians.get(name, jnp.full((result.size, direction.size), unknown))
+        jacobian = jnp.asarray(jacobian, result.dtype).reshape(result.size, direction.size)
+        return jnp.sum(scaled(jacobian, direction.astype(result.dtype)), axis=1).reshape(result.shape)
 
     return {name: tangent(name, x) for name, x in results.items()}
 

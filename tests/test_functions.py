@@ -20,6 +20,7 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax import systems
+from drivetrain_jax.analyses import _tangents
 from drivetrain_jax.analysis import OUTCOME, Outcome, get_analysis
 from drivetrain_jax.analysis._base import make_request
 from drivetrain_jax.analysis.floquet import propagator
@@ -276,6 +277,19 @@ def test_wrong_input_is_one_line(call, message):
 
 
 @pytest.mark.full
+def test_a_result_without_a_derivative_spoils_no_other():
+    results = {"known": jnp.array(3.0), "other": jnp.zeros(2), "other_error": jnp.array(0.1)}
+
+    def tangents(direction):
+        return _tangents(results, {"known": jnp.array([2.0])}, [direction])
+
+    forward = tangents(jnp.array(1.0))
+    assert forward["known"] == 2.0 and jnp.isnan(forward["other"]).all() and forward["other_error"] == 0.0
+    known = jax.grad(lambda x: tangents(x)["known"])
+    only = {name: jnp.where(name == "known", jnp.ones_like(x), 0.0) for name, x in results.items()}
+    assert known(1.0) == jax.vjp(tangents, 1.0)[1](only)[0] == 2.0
+
+
 def test_an_empty_batch_has_empty_derivatives():
     slopes = jax.vmap(jax.grad(lambda s: dt.floquet(s).spectral_radius))(jax.tree.map(lambda _: jnp.zeros(0), SHAFT))
     assert slopes.beta.shape == (0,)

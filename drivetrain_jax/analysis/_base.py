@@ -180,8 +180,6 @@ class Analysis:
     #: ``derivatives(system, request, parameters, constants, results)``: Jacobians ``(..., P)`` of differentiable results at
     #: one point by all P ``parameters`` (arrays; ``constants`` hold the rest). ``results`` include ``derivative_outputs``.
     derivatives: Callable[..., Mapping[str, Array]] | None = None
-    #: The error for a second derivative, where only first ones exist.
-    once: str = ""
     #: ``derivative_outputs(outputs)``: results that ``derivatives`` needs besides the requested ones.
     derivative_outputs: Callable[[tuple[str, ...]], tuple[str, ...]] = lambda _: ()
     #: The analysis accepts ranges for axes, and returns a function of the parameters instead of values on a grid.

@@ -187,5 +187,4 @@ ANALYSIS = Analysis(
     },
     undecided="the spectral radius is 1 within its error: a smaller rtol than {rtol:g} may decide",
     derivatives=_derivatives,
-    once="floquet: got a second derivative, expected a first; take differences of the gradient",
 )
