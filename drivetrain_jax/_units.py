@@ -12,7 +12,7 @@ from contextlib import suppress
 from functools import cache, lru_cache
 from typing import Any
 
-_NUMBER = re.compile(r"\s*([+-]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?inf)\s*(.*?)\s*", re.DOTALL)
+_NUMBER = re.compile(r"\s*([+-]?(?:\d+(?:_\d+)*\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[+-]?inf)\s*(.*?)\s*", re.DOTALL)
 _PRODUCT = re.compile(r"[\w\s*/^.·°%()²³⁴⁻¹-]+")
 # The units of engineers, in the language of pint; a plural s and prefixes are understood.
 _UNITS = (

@@ -15,7 +15,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -282,7 +282,9 @@ def _number_or_range(name: str, value: Any) -> Any:
             numbers = [f"{end!r} {unit}" if unit else end for (end, _), unit in zip(known, units, strict=True)]
             return numbers[0] if len(numbers) == 1 else tuple(numbers)
     elif isinstance(value, (int, float)) and not isinstance(value, bool):
-        return float(value)
+        # An integer may have too many digits for a number.
+        with suppress(OverflowError):
+            return float(value)
     raise InputError(f"{name} = {value!r}: expected a number or LOW:HIGH, with or without units (200:4000rpm)")
 
 

@@ -78,6 +78,7 @@ def test_a_comma_is_explained(text, remark):
         ("1 m/rad", "N m"),
         ("1 N m", "kg m2"),
         ("1 (", "m"),
+        ("1_ deg", "rad"),
         ("1 2 m", "m"),
         ("1 m**1e9", "m"),
         ("deg", "rad"),

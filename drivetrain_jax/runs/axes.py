@@ -97,10 +97,14 @@ def axis_table(parameter: Parameter, name: str, keys: Any, where: str, *, keep: 
     split = _units.split(texts[0]) if keep and texts else None
     described = in_unit(parameter, split[1]) if split else parameter
 
-    size = 1 if described is parameter else _units.factor(parameter.units, described.units)
+    # The unit of the scene may leave out the radian, N m for N m/rad; the parameter's own does not.
+    size = 1 if described is parameter else 1 / _units.factor(described.units, parameter.units)
 
     def plain(value: Any) -> Any:
-        return _units.number(value, described.units) if isinstance(value, str) else value and value * size
+        if not isinstance(value, str):
+            return value and value * size
+        # A quotient such as "11/41" has no unit.
+        return parameter.check(value) if parameter.fraction else _units.number(value, described.units)
 
     values = None if table.values is None else [plain(value) for value in table.values]
     return msgspec.structs.replace(table, start=plain(table.start), stop=plain(table.stop), values=values), described

@@ -101,6 +101,8 @@ def _joined(columns: list[Axis], quantities: list[Axis]) -> list[Axis]:
     for axis in columns:
         for extreme in (axis.values.min(), axis.values.max()):
             checked(replace(axis.parameter, name=axis.name, listed=False), float(extreme), "axes.")
+    if quantities and not columns:
+        raise InputError(f"axes.{quantities[0].name}: no parameter follows from it in this scene; leave it out")
     return [replace(columns[0], given=tuple(quantities), also=tuple(columns[1:]))] if columns else []
 
 

@@ -60,8 +60,8 @@ class ReusableResult:
         """Yield our points and their results in blocks, so that no result is loaded as a whole."""
         arrays = {name: sweep_first(consolidate.map_variable(self.path, name), self.grid) for name in self.names}
         for start in range(0, self.ours.size, _BLOCK):
-            place = self.grid.place(self.theirs[start : start + _BLOCK])
-            results = {name: np.array(array[place]) for name, array in arrays.items()}
+            points = self.theirs[start : start + _BLOCK]
+            results = {name: _rows(array, self.grid, points) for name, array in arrays.items()}
             if self.grid.path_is_fixed:
                 results = {name: values[:, None] for name, values in results.items()}
             yield self.ours[start : start + _BLOCK], results
@@ -134,7 +134,7 @@ def find(job: Job, path: Path) -> ReusableResult:
     grid = Grid.of(scene)
     theirs, ours = _same_points(scene, grid, job)
     if theirs.size:
-        outcome = sweep_first(consolidate.map_variable(path, OUTCOME.name), grid)[grid.place(theirs)]
+        outcome = _rows(sweep_first(consolidate.map_variable(path, OUTCOME.name), grid), grid, theirs)
         kept = ~(outcome == Outcome.LOST).any(axis=tuple(range(1, outcome.ndim)))
         theirs, ours = theirs[kept], ours[kept]
     if not theirs.size:
@@ -143,6 +143,12 @@ def find(job: Job, path: Path) -> ReusableResult:
     is_covered = wanted and np.unique(theirs).size == grid.size
     stored = tuple(variable.name for variable in result_variables(job.scene))
     return ReusableResult(path, str(attrs["digest"]), stored, grid, theirs, ours, is_covered)
+
+
+def _rows(array: np.ndarray, grid: Grid, points: np.ndarray) -> np.ndarray:
+    """A copy of the results of these ``points``; a grid without axes has one point, which may occur several times."""
+    rows = np.array(array[grid.place(points)])
+    return rows if grid.shape else np.repeat(rows, len(points), axis=0)
 
 
 def _same_points(scene: Scene, grid: Grid, job: Job) -> tuple[np.ndarray, np.ndarray]:

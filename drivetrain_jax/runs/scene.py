@@ -29,6 +29,8 @@ Ranges = dict[str, tuple[float, float]]
 _USUAL_SIZE = 4
 # Dimensions of the elements of a chain, which the parts of a scene name.
 _OF_ELEMENTS = ("shaft", "joint")
+# Largest integer below which every one is a float.
+_MOST_EXACT = 2.0**53
 # Name of the system that stands for a function in the scene of its sweep.
 FUNCTION = "function"
 
@@ -238,10 +240,24 @@ def _fixed(
             raise InputError(f"{where}.{axis.name}: expected {name}[0] to {name}[{len(whole) - 1}]")
     if check := analysis.model(system).check:
         try:
-            check(fixed)
+            for values in _extremes(fixed, axes):
+                check(values)
         except ValueError as error:
             raise InputError(f"fixed.{error}") from None
     return fixed
+
+
+def _extremes(fixed: Mapping[str, Any], axes: tuple[Axis, ...]) -> list[dict[str, Any]]:
+    """The values to check against each other: ``fixed`` with the largest value of each number that varies; and with 0 for
+    the entries of lists that pass through 0, which may not be allowed."""
+    parts = [part for axis in axes for part in axis.together]
+    known = {**fixed} | {part.name: part.values.max().item() for part in parts if part.entry is None}
+    zeros = dict(known)
+    for part in parts:
+        if part.entry is not None and not part.values.all():
+            whole = zeros[part.parameter.name]
+            zeros[part.parameter.name] = (*whole[: part.entry], 0.0, *whole[part.entry + 1 :])
+    return [known, zeros] if zeros != known else [known]
 
 
 def _check_path(scene: Scene) -> None:
@@ -300,6 +316,8 @@ def axes_of(
         numbers = np.asarray(values, float)
         for value in numbers if axes and scalar.integer else ():
             checked(scalar, float(value), "axes.")
+        if scalar.integer and np.abs(numbers).max(initial=0.0) > _MOST_EXACT:
+            raise InputError(f"{where}.{name} = {np.abs(numbers).max():g}: expected integers up to 2^53")
         numbers = numbers.astype(np.int64) if scalar.integer else numbers
         varying.append(Axis(name, replace(scalar, name=base), entry, numbers))
     lengths = {axis.name: len(axis.values) for axis in varying}

@@ -163,6 +163,23 @@ def _shown(value: Any) -> str:
     return repr(list(value) if isinstance(value, tuple) else value)
 
 
+def _axes(conversion: Conversion, needs: list[Any]) -> list[str]:
+    """The axis along which ``needs`` vary, if any; :class:`InputError` for several."""
+    axes = list(dict.fromkeys(value.axis for value in needs if isinstance(value, Along)))
+    if len(axes) > 1:
+        raise InputError(
+            f"axes.{axes[1]}: changes {conversion.parameter} together with {axes[0]}; expected one of them as an axis, "
+            "or both in [points]"
+        )
+    return axes
+
+
+def _at(value: Any, i: int) -> Any:
+    if isinstance(value, tuple):
+        return tuple(_at(entry, i) for entry in value)
+    return value.values[i].item() if isinstance(value, Along) else value
+
+
 def _evaluated(conversion: Conversion, needs: list[Any]) -> Any:
     """The value of a conversion: a number or word, a tuple of them, :class:`Along`, or a tuple with some of these."""
     listed = [
@@ -177,13 +194,17 @@ def _evaluated(conversion: Conversion, needs: list[Any]) -> Any:
         count = next(iter(lengths.values()))
         entries = [[v[i] if is_listed else v for v, is_listed in zip(needs, listed, strict=True)] for i in range(count)]
         return tuple(_evaluated(conversion, entry) for entry in entries)
-    axes = list(dict.fromkeys(value.axis for value in needs if isinstance(value, Along)))
-    if len(axes) > 1:
-        raise InputError(
-            f"axes.{axes[1]}: changes {conversion.parameter} together with {axes[0]}; expected one of them as an axis, "
-            "or both in [points]"
-        )
-    value = conversion.value(*(need.values if isinstance(need, Along) else need for need in needs))
+    axes = _axes(conversion, needs)
+    value: Any
+    try:
+        value = conversion.value(*(need.values if isinstance(need, Along) else need for need in needs))
+    except TypeError:
+        inside = [entry for value in needs if isinstance(value, tuple) for entry in value if isinstance(entry, Along)]
+        if not inside:
+            raise
+        # Arithmetic with an entry of a whole list that varies: value by value.
+        axes = _axes(conversion, [*needs, *inside])
+        value = [conversion.value(*(_at(need, i) for need in needs)) for i in range(len(inside[0].values))]
     if axes:
         return Along(axes[0], np.asarray(value, float))
     return value if isinstance(value, (str, jax.core.Tracer, Along)) or np.ndim(value) else float(value)

@@ -106,6 +106,25 @@ def test_an_axis_keeps_the_unit_in_which_it_is_given():
     assert axis.values == pytest.approx(np.array([10, 30, 50]) * 2 * math.pi * math.sqrt(2 / 6e4), rel=1e-14)
 
 
+def test_a_unit_without_its_radian_is_known_on_an_axis():
+    """The tables of a scene write the radian or not, as fixed values do."""
+    fixed = {name: value for name, value in TRUCK.items() if name != "k1"} | {"angle": 12, "speed": 1000}
+    written, bare = (
+        load_scene(cardan(axes={"k1": [f"50 {unit}", f"60 {unit}"]}, fixed=fixed)).axes[0]
+        for unit in ("kN m/rad", "kN m")
+    )
+    np.testing.assert_array_equal(written.values, bare.values)
+    assert bare.shown.values.tolist() == [50, 60] and bare.shown.parameter.units == "kN m"
+
+
+@pytest.mark.full
+def test_a_range_of_the_physical_speed_has_the_tongues_of_the_parameter():
+    """C+ is a fifteen-thousandth of the range wide: only its prediction tells where to look."""
+    shaft = {"J1": 2, "J2": 200.0, "k1": 6e4, "k2": 6e4, "c1": 0.02, "c2": 0.02, "angle": 8}
+    said = dt.point("cardan", "floquet", speed=("496.196 rpm", "3638.77 rpm"), **shaft).sentence
+    assert said.startswith("Unstable at speed = 1229.38 to 1229.46 (C+1), 2336.32 to 2347.77 (S21) rpm; the rest")
+
+
 @pytest.mark.full
 def test_one_quantity_may_change_several_parameters():
     scene = cardan("forced", axes={"J1": [1.0, 2.0]}, fixed=TRUCK | {"angle": 12, "speed": 1000}, outputs=["amplitude"])
@@ -306,6 +325,15 @@ def test_mass_is_given_once():
 def test_a_length_that_looks_like_millimetres_is_warned_of():
     with pytest.warns(UserWarning, match=r'^length\[1\] = 900 m: more than 100 m; is "900 mm" meant\?$'):
         dt.Bicardan(length=[0.3, 900], EI=[1e4, 1e4], rhoA=[15, 15], k_A=1e6, k_D=1e6)
+
+
+def test_one_number_of_teeth_may_vary():
+    gear = {"system": "planetary", "analysis": "modes", "fixed": {"teeth": [20, 26, 72], "planet_angle": [0, 2, 4]}}
+    axis = load_scene(gear | {"axes": {"teeth[0]": [18, 20]}}).axes[0]
+    assert "phase_s[2]" in [part.name for part in axis.together]
+    for planets in ({}, {"planet_angle": [0, 2, 4]}):
+        without = gear | {"fixed": {"teeth": [20, 26, 72]} | planets, "axes": {"teeth[1]": [26, 28]}}
+        assert refused(without) == "axes.teeth[1]: no parameter follows from it in this scene; leave it out"
 
 
 @pytest.mark.full

@@ -204,6 +204,19 @@ def test_lists_of_points(tmp_path):
     agree(tmp_path / "g.nc", grid)
 
 
+def test_one_point_serves_a_list_with_that_point_twice(tmp_path):
+    one = {"system": "toy", "analysis": "toy", "outputs": NAMES, "fixed": {"a": 3.0, "b": 1.0}}
+    run_to_file(one, tmp_path / "one.nc")
+    points = {
+        "system": "toy",
+        "analysis": "toy",
+        "outputs": NAMES,
+        "points": {"a": [3.0, 3.0, 4.0], "b": [1.0, 1.0, 2.0]},
+    }
+    assert counts(run_to_file(points, tmp_path / "r.nc", reuse=[tmp_path / "one.nc"])) == (3, 1, 2)
+    agree(tmp_path / "r.nc", points)
+
+
 ALONE = {"system": "toy", "analysis": "line"}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import jax.numpy as jnp
 import numpy as np
@@ -289,6 +290,40 @@ WRONG = {
         "2000000000",
     ),
 }
+
+
+CHAIN = {"k": [1e4, 2e4], "J": [0.1, 0.2], "c": [1.0, 1.0], "speed": 10.0, "beta": [0.1, 0.2]}
+NO_RATIO = "fixed.ratio[1] = 0: expected a ratio other than 0"
+NO_MASS = "expected 0 for a segment without mass (rhoA[0] = 0)"
+
+
+@pytest.mark.parametrize(
+    ("scene", "fixed", "axes", "message"),
+    [
+        ({"system": "driveline", "analysis": "floquet"}, CHAIN | {"ratio": [1, 1]}, {"ratio[1]": [-1, 0, 1]}, NO_RATIO),
+        (SHAFT, TWO_SEGMENTS | {"rhoI": [1e-3, 1e-3]}, {"rhoA[0]": [0, 1]}, NO_MASS),
+        (SHAFT, TWO_SEGMENTS | {"rhoA": [0, 1]}, {"rhoI": [0, 1e-3]}, NO_MASS),
+        (SHAFT, TWO_SEGMENTS, {"length[0]": [1.0, 2.0]}, ""),
+    ],
+)
+def test_values_that_do_not_go_together_are_refused_where_they_vary(scene, fixed, axes, message):
+    scene = {**scene, "fixed": fixed, "axes": axes}
+    if not message:
+        load_scene(scene)
+        return
+    with pytest.raises(InputError, match=re.escape(message)):
+        load_scene(scene)
+
+
+def test_a_quotient_may_be_a_value_of_an_axis():
+    scene = {"system": "driveline", "analysis": "floquet", "fixed": CHAIN | {"ratio": [1, 1]}}
+    (axis,) = load_scene(scene | {"axes": {"ratio[0]": ["1/2", "1/3"]}}).axes
+    assert axis.values.tolist() == [1 / 2, 1 / 3]
+
+
+def test_an_integer_is_no_rounded_number():
+    with pytest.raises(InputError, match=r"axes\.n = .*: expected integers up to 2\^53"):
+        load_scene(changed(axes={"n": [1, 2**70]}))
 
 
 @pytest.mark.parametrize("case", WRONG)
