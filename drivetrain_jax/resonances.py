@@ -264,7 +264,7 @@ def _own_orders(system: str, values: Mapping[str, Any]) -> Orders | None:
     """The orders that follow from the parameters."""
     if system == "bicardan":
         # A joint under an angle and a torque bends the shaft twice a turn.
-        discs = any(np.any(values.get(name) or 0.0) for name in ("Ip_A", "Ip_D", "Ip_joint"))
+        discs = any(np.any(values.get(name) or 0.0) for name in ("Ip_A", "Ip_D", "Ip_joint", "rhoIp"))
         return Orders("shaft", {"order 1": 1.0, "order 2 (joints)": 2.0}, still=discs)
     if system == "driveline":
         # A joint is excited twice a turn of its input, and less by multiples of it.

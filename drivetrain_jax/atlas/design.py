@@ -117,7 +117,7 @@ def check_window(safe: Range, interval: Interval, line: Line, criteria: Criteria
             value = crossing.value + side * max(_BOUNDS * crossing.error, _PART * span)
             outer += [value] if _unstable(line, value) else []
     # Without a margin the window ends at the crossings: keep the same distance from them inside.
-    step = _PART * span
+    step = min(_PART * span, (safe[1] - safe[0]) / 4)
     inner = np.linspace(safe[0] + step, safe[1] - step, _SAMPLES)
     rho = _solve(direct, part, {line.parameter: np.append(inner, outer)})
     return _check(rho[:_SAMPLES], rho[_SAMPLES:], criteria, len(rho))

@@ -99,7 +99,7 @@ class DrivetrainAccessor:
 
         Raises: InputError if the system predicts none along the axes of this result.
         """
-        from drivetrain_jax.datasets.figure import resonances
+        from drivetrain_jax.runs.predicted import resonances
 
         self._analysis()
         predicted = resonances(self._dataset)

@@ -205,8 +205,7 @@ def _values(atlas: StoredAtlas, name: str, entry: Any) -> np.ndarray:
         values = np.empty(0)
     if values.dtype.kind not in "iuf" or values.ndim > 1 or not values.size:
         raise InputError(f"grid.{label} = {shown(entry)}: expected {_ALLOWED}")
-    atlas.check_within(name, values)
-    return values.astype(float)
+    return atlas.check_within(name, values).astype(float)
 
 
 class _Cells:

@@ -20,7 +20,7 @@ from drivetrain_jax.atlas.criteria import has_boundaries
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.windows import Crossing, Interval, narrow
 from drivetrain_jax.runs import toml
-from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, check_same
+from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, check_same, moved_within
 from drivetrain_jax.runs.physical import GivenData, in_parameters
 from drivetrain_jax.runs.reply import (
     Reply,
@@ -51,10 +51,6 @@ BEYOND = {
 Shown = tuple[str, float, str]
 Show = Callable[[str, float], Shown]
 Range = tuple[float, float]
-# Relative tolerance within which a value equals an end of a range: values converted from other units, or copied from a
-# message, are rounded.
-_SAME = 1e-9
-
 
 # Relative distance of a predicted resonance from a range that is named after it.
 _NEAR = 0.05
@@ -120,7 +116,7 @@ class AtlasQuery:
                 check_same(name, value, atlas.fixed[name], source)
         kept = {name for name in atlas.parameters if name not in free or name in within}
         kept_values = {name: atlas.ranges[name] for name in ranges}
-        kept_values |= {name: _within(value, atlas.ranges[name]) for name, value in values.items() if name in kept}
+        kept_values |= {name: moved_within(value, atlas.ranges[name]) for name, value in values.items() if name in kept}
         backs = {name: shaft.back(name) for name in atlas.parameters if shaft and name not in given}
         seen = replace(atlas, views={name: back for name, back in backs.items() if back})
         for name in values:
@@ -206,15 +202,6 @@ def _unit(units: str) -> str:
 
 def _plain(value: Any) -> Any:
     return tuple(map(_plain, value)) if isinstance(value, tuple) else toml.plain(value)
-
-
-def _within(value: Any, ends: Range) -> Any:
-    """``value`` (or both ends of a range), moved to an end of the atlas if it is that close."""
-    if isinstance(value, tuple):
-        return tuple(_within(number, ends) for number in value)
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return value
-    return next((end for end in ends if math.isclose(value, end, rel_tol=_SAME)), value)
 
 
 def _check_range(atlas: StoredAtlas, name: str, value: Any, wanted: bool) -> None:
@@ -419,7 +406,8 @@ def speed_windows(
         "proofs": proved,
         **forced,
     }
-    where = _OPEN if answer.undecided else "with this margin" if margin else "within the atlas"
+    whole = "in this range" if speed in asked.values else "within the atlas"
+    where = _OPEN if answer.undecided else "with this margin" if margin else whole
     lines += [] if answer.windows else [f"  none {where}"]
     lines += [*_undecided(asked, speed, answer.undecided), *proofs]
     return Reply(lines, data, _where_unstable(asked, part, speed, answer, names))

@@ -24,7 +24,7 @@ from drivetrain_jax.atlas.exclusion import Search
 from drivetrain_jax.atlas.panels import Atlas
 from drivetrain_jax.atlas.tips import Tips, find_tips
 from drivetrain_jax.atlas.windows import narrow, stability_along
-from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, check_same, open_atlas
+from drivetrain_jax.runs.atlas_file import StoredAtlas, as_given, check_same, moved_within, open_atlas
 from drivetrain_jax.store.files import source_digest
 from drivetrain_jax.systems import System, get_system
 
@@ -98,8 +98,8 @@ def with_boundaries(dataset: xr.Dataset, source: str | Path | xr.Dataset) -> xr.
     for name in _shown(system, list(atlas.parameters)):
         if name not in known:
             raise InputError(f"{name}: missing in the chart; expected {atlas.allowed(name)}")
-        atlas.check_within(name, np.ravel(known[name]))
-        low, high = float(known[name].min()), float(known[name].max())
+        inside = atlas.check_within(name, np.ravel(known[name]))
+        low, high = float(inside.min()), float(inside.max())
         plane |= {name: (low, high)} if low < high else {}
         fixed |= {} if low < high else {name: low}
     if len(plane) != 2 or dataset["outcome"].squeeze().ndim != 2:
@@ -140,16 +140,18 @@ def _curves_in_physical_units(dataset: xr.Dataset, name: str, other: str, units:
 
 
 def _ranges(atlas: StoredAtlas, part: Mapping[str, Any]) -> dict[str, Any]:
+    moved = {}
     for name, value in part.items():
         if name not in atlas.parameters:
             atlas.refuse(name, value)
         low, high = atlas.ranges[name]
         rising = not isinstance(value, tuple) or value[0] < value[1]
-        if not rising or not all(low <= end <= high for end in np.atleast_1d(value)):
+        moved[name] = moved_within(value, (low, high))
+        if not rising or not all(low <= end <= high for end in np.atleast_1d(moved[name])):
             shown, *ends = atlas.viewed_as(name, *np.atleast_1d(value))
             text = as_given(tuple(ends))
             raise InputError(f"{shown.name} = {text}: expected a number or LOW:HIGH, {atlas.allowed(name)}")
-    return {name: part.get(name, atlas.ranges[name]) for name in atlas.parameters}
+    return {name: moved.get(name, atlas.ranges[name]) for name in atlas.parameters}
 
 
 def _shown(system: type[System], names: list[str]) -> list[str]:

@@ -46,6 +46,20 @@ View = tuple[Parameter, Callable[[Any], Any]]
 SAME_FIXED = 5e-4
 
 
+# Relative tolerance within which a value equals an end of a range: values converted from other units, or copied from a
+# message, are rounded.
+SAME_END = 1e-9
+
+
+def moved_within(value: Any, ends: tuple[float, float]) -> Any:
+    """``value`` (or both ends of a range), moved to an end of the atlas if it is that close."""
+    if isinstance(value, tuple):
+        return tuple(moved_within(number, ends) for number in value)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return value
+    return next((end for end in ends if math.isclose(value, end, rel_tol=SAME_END)), value)
+
+
 def check_same(name: str, value: Any, fixed: float, source: str = "", units: str = "1") -> None:
     """Raise :class:`InputError` unless ``value`` is the ``fixed`` one of the atlas, which may be typed with four digits.
 
@@ -277,7 +291,7 @@ class StoredAtlas:
             if quantity and (name in units or quantity.name in given or quantity.name in named):
                 written = np.asarray(given.get(quantity.name, "")).dtype.kind == "U"
                 unit = units.get(name, quantity.units) if written else quantity.units
-                views[name] = in_unit(quantity, unit), partial(_scaled, convert, factor(quantity.units, unit))
+                views[name] = in_unit(quantity, unit), partial(_scaled, convert, 1 / factor(unit, quantity.units))
         return replace(self, views=views)
 
     def labels(self, name: str) -> dict[str, str]:
@@ -285,13 +299,19 @@ class StoredAtlas:
         parameter = self.scene.system.parameter(name)
         return {"units": parameter.units, "long_name": parameter.long_name}
 
-    def check_within(self, name: str, numbers: np.ndarray) -> None:
-        """Raise :class:`InputError` for values of a parameter outside its range."""
+    def check_within(self, name: str, numbers: np.ndarray) -> np.ndarray:
+        """Values of a parameter, those that are an end of its range up to rounding moved to it; :class:`InputError` for
+        values outside."""
         low, high = self.ranges[name]
-        outside = numbers[~((numbers >= low) & (numbers <= high))]
-        if outside.size:
-            shown, value = self.viewed_as(name, outside.flat[0])
+        outside = ~((numbers >= low) & (numbers <= high))
+        if outside.any():
+            ends = np.where(numbers < low, low, high)
+            same = outside & np.isclose(numbers, ends, rtol=SAME_END, atol=0)
+            numbers, outside = np.where(same, ends, numbers), outside & ~same
+        if outside.any():
+            shown, value = self.viewed_as(name, numbers[outside].flat[0])
             raise InputError(f"{shown.name} = {value:.10g}: expected {self.allowed(name)}")
+        return numbers
 
     def refuse(self, name: str, value: Any, *others: str) -> NoReturn:
         """Raise :class:`InputError` for a name that is neither a parameter nor one of ``others``."""
@@ -479,8 +499,10 @@ class StoredAtlas:
             numbers = np.empty(0, object)
         if numbers.dtype.kind not in "iuf":
             raise InputError(f"{name} = {shown(values[name])}: expected numbers")
-        self.check_within(name, numbers)
-        return values[name]
+        moved = self.check_within(name, numbers)
+        if np.array_equal(moved, numbers):
+            return values[name]
+        return values[name].copy(data=moved) if hasattr(values[name], "dims") else moved
 
     def _axis(self, name: str, values: np.ndarray) -> Axis:
         shown, quantity = self.viewed_as(name, values)

@@ -26,9 +26,10 @@ from drivetrain_jax.analysis import Analysis
 from drivetrain_jax.analysis._base import checked
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
 from drivetrain_jax.runs.physical import GivenData, described
+from drivetrain_jax.runs.predicted import LABELS, resonances
 from drivetrain_jax.runs.scene import Scene
-from drivetrain_jax.systems import System, get_system
-from drivetrain_jax.view.style import parameters, runs, scene_key, units_of
+from drivetrain_jax.systems import System
+from drivetrain_jax.view.style import runs, scene_key, units_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -463,9 +464,10 @@ def with_unstable_ranges(dataset: xr.Dataset) -> tuple[xr.Dataset, float]:
         # Above 1 is what the verdict calls unstable.
         return np.where(unstable, np.maximum(radius, 1 + 1e-15), np.minimum(radius, 1.0))[:, None]
 
-    known, fixed = get_system(str(dataset.attrs["system"])).resonances, parameters(dataset)
-    foretold = known is not None and known.axis == name and set(known.parameters) <= fixed.keys()
-    predicted, labels = (known.values(fixed), known.labels) if known and foretold else (np.empty(0), ())
+    known, predicted, labels = resonances(dataset), np.empty(0), []
+    # The axis may be a physical datum, such as the speed in rpm.
+    if known is not None and known.name == f"{LABELS}_{name}" and known.ndim == 1:
+        predicted, labels = known.values, known[LABELS].values.tolist()
     likely = np.concatenate([axis.values, predicted[np.isfinite(predicted)]])
     x, y = _sampled(size, float(axis.min()), float(axis.max()), likely, 1.0, _VERDICT_ROUNDS)
     ends = np.reshape(runs(x, y[:, 0] > 1), (-1, 2))

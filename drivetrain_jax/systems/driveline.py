@@ -211,8 +211,8 @@ def check(fixed: Values) -> None:
             raise ValueError(
                 f"{name}: {counted(len(value), 'entry', 'entries')} where {first} has {count}; expected one per element"
             )
-    ratio, speed, speeds = fixed.get("ratio", ()), 1.0, []
-    for i, (r, b) in enumerate(zip(ratio, fixed.get("beta", ()), strict=False)):
+    ratio, beta, speed, speeds = fixed.get("ratio", ()), fixed.get("beta", ()), 1.0, []
+    for i, (r, b) in enumerate(zip(ratio, beta if len(beta) else (0,) * len(ratio), strict=False)):
         if not _is_straight(b):
             speeds.append(speed)
         if not _is_number(r):
@@ -263,7 +263,7 @@ def _is_unit(gear: Any) -> Any:
 
 
 def best_phases(beta: Components, phase: Components, ratio: Components) -> list[Any]:
-    """Phases in [0, pi) that minimise the uneven rotation of joints at one speed, of which the first one keeps its own.
+    """Phases in [0, pi) that minimise the uneven rotation of each run of joints at one speed; its first joint keeps its own.
 
     A joint moves a point of the hyperbolic plane by l = ln sec(beta) in the direction of its phase, eq. (8). The path closes
     if no l is longer than all others together; each joint turns back as far as the remaining ones can make up for.
@@ -327,7 +327,9 @@ PHASING = (
     Variable("speed_variation", "1", "speed of the rigid output, peak to peak over its mean", lower=0.0),
     Variable("angle_variation", "rad", "lead of the rigid output, peak to peak", lower=0.0),
     Variable("least_variation", "1", "speed_variation with the phases best_phase", lower=0.0),
-    Variable("best_phase", "rad", "phases that minimise speed_variation, of the joints at one speed", ("joint",)),
+    Variable(
+        "best_phase", "rad", "phases that minimise speed_variation, of each run of joints at one speed", ("joint",)
+    ),
 )
 
 
@@ -343,8 +345,9 @@ def phasing_sentence(values: Values, parameters: Values) -> str:
         speeds = np.cumprod([1.0, *np.abs(parameters.get("ratio") or ())])
         angles = parameters.get("beta") or ()
         bent = [speed for speed, angle in zip(speeds, angles, strict=False) if angle != 0] or [1.0]
-        which = "no phases" if max(bent) - min(bent) <= _WHOLE else "no phases of the joints at one speed"
-        best = f"{which} make it less"
+        # Joints at different speeds have no closed form: each run of joints at one speed was made even for itself.
+        runs = "the best phases of each run of joints at one speed do not"
+        best = f"{'no phases' if max(bent) - min(bent) <= _WHOLE else runs} make it less"
     return f"The output speed varies by {round(100 * part, 9):.4g} % peak to peak ({degrees:.4g} deg{rpm}); {best}."
 
 

@@ -95,6 +95,10 @@ def test_the_ends_of_an_atlas_may_be_given_in_other_units(J1, k1):
     exact = atlas_answers.widest_angle(atlas, {"Omega": (1.3, 1.5)}).data["value"]
     for speed in (ends, tuple(float(f"{end:.10g}") for end in ends)):
         assert atlas_answers.widest_angle(atlas, {**data, "speed": speed}).data["value"] == exact
+    near = atlas.check_within("Omega", np.array([1.3 * (1 - 1e-10), 1.4, 1.5 * (1 + 1e-10)]))
+    assert near.tolist() == [1.3, 1.4, 1.5]
+    with pytest.raises(dt.InputError, match=r"^Omega = 1\.50000015: expected"):
+        atlas.check_within("Omega", np.array([1.5 * (1 + 1e-7)]))
     with pytest.raises(dt.InputError, match=r"^speed = .*: expected speed=LOW:HIGH within"):
         atlas_answers.widest_angle(atlas, {**data, "speed": (ends[0] * (1 - 1e-8), ends[1])})
 

@@ -192,6 +192,7 @@ def test_ratios_before_a_joint_alone_have_no_derivative():
         ({"ratio": [1.0, 0.3333, 1.0]}, f"common period of up to {MOST_TURNS} turns"),
         ({"ratio": [1.0, "50/49", 1.0]}, "common period"),
         ({"ratio": [1.0, 0.0, 1.0]}, r"ratio\[1\] = 0"),
+        ({"ratio": [1.0, 0.0, 1.0], "beta": []}, r"ratio\[1\] = 0"),
         ({"J": [1.0, 2.0]}, "J: 2 entries where k has 3"),
         ({"beta": [0.1]}, "beta: 1 entry where k has 3"),
     ],
@@ -429,7 +430,7 @@ def test_phases_across_a_gear_make_up_for_nothing():
     alone = rotation(["20 deg"], [0.0])
     np.testing.assert_allclose(found.best_phase, [0.0, 0.3], rtol=1e-12)
     assert found.speed_variation == pytest.approx(found.least_variation, rel=1e-12)
-    assert found.sentence.endswith("no phases of the joints at one speed make it less.")
+    assert found.sentence.endswith("the best phases of each run of joints at one speed do not make it less.")
     # The first joint's speed, doubled, passes a joint of the double speed.
     assert alone.speed_variation < found.speed_variation < 2 * alone.speed_variation * 1.01
 
@@ -490,7 +491,7 @@ def test_unstable_ranges_are_those_between_changes_of_the_verdict(monkeypatch):
     monkeypatch.setattr("drivetrain_jax.runs.run.run", run)
     axis = xr.DataArray(np.linspace(200.0, 500.0, 31), dims="speed", attrs={"units": "rad/s"})
     fixed = {name: {"value": value, "units": "1"} for name, value in shaft.items()}
-    attrs = {"system": "driveline", "scene": 'system = "driveline"', "fixed_parameters": json.dumps(fixed)}
+    attrs = {"system": "driveline", "scene": "[axes]\nspeed = {}", "fixed_parameters": json.dumps(fixed)}
     result = xr.Dataset({"outcome": ("speed", np.zeros(31, int))}, {"speed": axis}, attrs)
     answer, worst = with_unstable_ranges(result)
     expected = sorted([(narrow - 1e-3, narrow + 1e-3), (395.25, 405.25)])
