@@ -118,7 +118,7 @@ function actions(app) {
     cursor: () => app.panes.forEach((pane) => (drawCursor(app, pane), tell(app, pane))),
     point(at) {
       app.hover = at && at.every((v) => v >= 0 && v <= 1) ? [...app.state.panes[0].values] : null;
-      if (app.hover) axesAcross().forEach((k, i) => (app.hover[k] = valueAt(k, at[i])));
+      if (app.hover) axesAcross().forEach((k, i) => (app.hover[k] = clamp(k, valueAt(k, at[i]))));
       app.cursor();
     },
     pin: (at) => at.every((v) => v >= 0 && v <= 1) && setPoint((k, i) => valueAt(k, at[i])),
@@ -272,7 +272,8 @@ function slider(app, k, number, axis) {
   const range = Object.assign(document.createElement("input"), { type: "range", min: 0, max: 1, step: "any", ariaLabel: label });
   const field = Object.assign(document.createElement("input"), { ariaLabel: `${label}, number`, inputMode: "decimal" });
   const set = (value) => app.change((state) => state.panes.forEach((pane, i) => (axis || i === number) && (pane.values[k] = value)), !axis);
-  range.addEventListener("input", () => set(parameter.lower + range.valueAsNumber * (parameter.upper - parameter.lower)));
+  // By rounding the sum may lie beyond the end.
+  range.addEventListener("input", () => set(Math.min(parameter.lower + range.valueAsNumber * (parameter.upper - parameter.lower), parameter.upper)));
   field.addEventListener("change", () => {
     const { factor } = unitOf(parameter, app.state.units), value = checked(field, (v) => inRange(parameter, v / factor));
     if (value !== undefined) set(Math.min(Math.max(value / factor, parameter.lower), parameter.upper));
@@ -364,7 +365,7 @@ function buildExports(app) {
     save(`chart${"AB"[pane.number]}.svg`, new Blob([svg(list, width, height, cells)], { type: "image/svg+xml" }));
   }));
   get("csv").addEventListener("click", () => app.panes.forEach((pane) => {
-    const { axes, lower, upper } = app.state, [xs, ys] = [axes.at(-1), axes[0]].map((k) => Float64Array.from({ length: TABLE }, (_, i) => lower[k] + ((upper[k] - lower[k]) * i) / (TABLE - 1)));
+    const { axes, lower, upper } = app.state, [xs, ys] = [axes.at(-1), axes[0]].map((k) => Float64Array.from({ length: TABLE }, (_, i) => Math.min(lower[k] + ((upper[k] - lower[k]) * i) / (TABLE - 1), upper[k])));
     const question = { values: app.state.panes[pane.number].values, axes, xs, ys };
     save(`chart${"AB"[pane.number]}.csv`, new Blob([csvText(answer(atlas, question), axes.map((k) => atlas.parameters[k].name), xs, ys)], { type: "text/csv" }));
   }));

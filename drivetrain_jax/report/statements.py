@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from drivetrain_jax.resonances import FREQUENCIES, operating_range, stored_orders
-from drivetrain_jax.view.charts import growth_of, role
+from drivetrain_jax.view.charts import growth_of, role, valid
 from drivetrain_jax.view.style import (
     ASKED,
     MOST_RANGES,
@@ -59,14 +59,16 @@ def statements(
 
 def _about_codes(dataset: xr.Dataset, variable: xr.DataArray, ranges: bool) -> Iterator[str]:
     """The share of every meaning, and the ranges of the speed or of the only axis that have it."""
-    meanings = flag_words(variable)
+    # Points without a value store the last code.
+    meanings, variable = flag_words(variable), valid(dataset, str(variable.name))
     # A remark in brackets explains codes, most of which do not occur.
     name = re.sub(r" \(.*\)$", "", str(variable.attrs.get("long_name", variable.name)))
     if variable.size == 1:
-        yield f"{_capital(name)}: {value_text(variable, variable.values.item()) or 'unknown'}."
+        yield f"{_capital(name)}: {value_text(variable, variable.values.item())}."
         return
     shares = {word.replace("_", " "): float(np.mean(variable.values == code)) for code, word in meanings.items()}
-    parts = ", ".join(f"{word} {_share(share)}" for word, share in shares.items() if share)
+    without = float(np.mean(~np.isin(variable.values, list(meanings))))
+    parts = ", ".join(f"{word} {_share(s)}" for word, s in (*shares.items(), ("without a value", without)) if s)
     yield f"{_capital(name)} at the points computed: {parts}."
     axis = _main_axis(dataset, variable) if ranges else None
     exact = axis is not None and f"unstable_{axis.name}" in dataset.coords
@@ -237,11 +239,11 @@ def _share(share: float) -> str:
 
 
 def axes_table(dataset: xr.Dataset) -> list[tuple[str, ...]]:
-    """Rows of the swept parameters: name, meaning, first value, last value, unit, and number of values."""
+    """Rows of the swept parameters: name, meaning, smallest value, largest value, unit, and number of values."""
     axes = [dataset[d] for d in dataset["outcome"].dims if d in dataset.coords]
     columns = [c for c in dataset.coords.values() if c.dims == ("point",) and c.name != "point"]
     return [
-        (scene_key(c), c.attrs.get("long_name", ""), *map(digits, c.values[[0, -1]]), units_of(c), str(c.size))
+        (scene_key(c), c.attrs.get("long_name", ""), *map(digits, _ends(c.values)), units_of(c), str(c.size))
         for c in (columns or axes)
         if c.size and c.dtype.kind in "fiu"
     ]
@@ -255,6 +257,10 @@ def fixed_table(dataset: xr.Dataset) -> list[tuple[str, ...]]:
         factor, units = unit_of(dataset, name, entry.get("units", "1"))
         rows.append((name, entry.get("long_name", ""), digits(_times(entry["value"], factor)), written_units(units)))
     return rows
+
+
+def _ends(values: np.ndarray) -> tuple[Any, Any]:
+    return values.min(), values.max()
 
 
 # Lists of a driveline in its drawing, each with the entry that stands for nothing.
@@ -298,7 +304,8 @@ def values_tables(dataset: xr.Dataset) -> list[Table]:
         places = [coordinates(dataset, variables[0], place) for place in np.ndindex(variables[0].shape)]
         head = [f"{name}{in_brackets(unit)}" for name, _, unit in places[0]] if places else []
         head += [f"{str(v.name).replace('_', ' ')}{in_brackets(units_of(v))}" for v in variables]
-        columns = [[value_text(v, value) for value in v.values.reshape(-1)] for v in variables]
+        known = [valid(dataset, str(v.name)) if flag_words(v) else v for v in variables]
+        columns = [[value_text(v, value) for value in v.values.reshape(-1)] for v in known]
         rows = [[value for _, value, _ in place] + [c[k] for c in columns] for k, place in enumerate(places)]
         tables.append((head, rows))
     return tables
@@ -307,7 +314,7 @@ def values_tables(dataset: xr.Dataset) -> list[Table]:
 def value_text(variable: xr.DataArray, value: Any) -> str:
     """A value as text: the meaning of a code."""
     meanings = flag_words(variable)
-    return meanings.get(int(value), "").replace("_", " ") if meanings else digits(value)
+    return meanings.get(int(value), "no value").replace("_", " ") if meanings else digits(value)
 
 
 def coordinates(dataset: xr.Dataset, variable: xr.DataArray, place: tuple[Any, ...]) -> list[tuple[str, str, str]]:

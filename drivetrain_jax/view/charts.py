@@ -374,6 +374,9 @@ def table_rows(dataset: xr.Dataset) -> list[tuple[str, str, str]]:
     for name in results(dataset):
         variable, units = dataset[name], units_of(dataset[name])
         label, words = str(variable.attrs.get("long_name", name)), flags(variable)
+        if words:
+            # A point without a value stores the last code.
+            variable, words = valid(dataset, name), [*words, FAILED, PENDING]
         for place in np.ndindex(variable.shape):
             entry = variable[place]
             numbered = zip(variable.dims, place, strict=True)

@@ -149,11 +149,19 @@ def _types_over(dataset: xr.Dataset, name: str) -> Figure:
         units = in_brackets(units_of(dataset["natural_frequency"]))
         labels.append(f"distance of close modes (numbers at the right){units}")
     fit_axis(axes, "x", x)
+    _draw_missing(sheet, dataset, name)
     sheet.label(axis_label(dataset[name]), *labels)
     shown = [kind for kind in colours if (types[np.isfinite(moving)] == kind).any() and "mode_type" in dataset]
     sheet.add(*(Line2D([], [], color=colours[kind], label=kind) for kind in shown))
     mixed = "coupled" in _types(dataset) and "coupled" not in types
     return sheet.finish(dataset, "coupled modes in the colour of their dominant family" if mixed else "")
+
+
+def _draw_missing(sheet: Sheet, dataset: xr.Dataset, name: str) -> None:
+    """Draw points without a value, failed or pending, as bands along the axis ``name``."""
+    codes = charts.computed(dataset)
+    for (axes,) in sheet.axes if codes.any() else ():
+        sheet.add(*charts.draw_flags(axes, codes, name))
 
 
 def _draw_coloured(axes: Axes, x: np.ndarray, curves: np.ndarray, colours: np.ndarray) -> None:
@@ -493,6 +501,7 @@ def whirl(dataset: xr.Dataset) -> Figure | None:
         axes.plot(*np.reshape(met, (-1, 2)).T, "o", markersize=3.5, color="black", markerfacecolor="white")
         numbers = [f"{float(f'{speed:.4g}'):.10g}" for speed, _ in met]
         sheet.later(partial(write_names, axes, met, numbers, offset=4.0, **_NUMBER))
+    _draw_missing(sheet, dataset, "speed")
     frequency = variable_label(dataset["whirl_frequency"])
     sheet.label(axis_label(dataset["speed"]), f"{frequency} (number of the mode at the right)")
     return sheet.finish(dataset)

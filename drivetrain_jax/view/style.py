@@ -191,7 +191,9 @@ def coordinate_text(coordinate: xr.DataArray) -> str:
 
 def ranges_text(axis: xr.DataArray, holds: np.ndarray) -> str:
     """The runs of sampled values of ``axis`` at which ``holds`` is true: ``speed = 1425, 2275 to 2290 rpm``."""
-    return runs_text(axis, runs(axis.values, holds))
+    # An axis keeps the order of its scene, in which neighbours of a list may lie far apart.
+    rising = np.argsort(axis.values, kind="stable")
+    return runs_text(axis, runs(axis.values[rising], holds[rising]))
 
 
 def runs(values: np.ndarray, holds: np.ndarray) -> tuple[tuple[float, float], ...]:
@@ -349,8 +351,9 @@ def unit_of(dataset: xr.Dataset, name: str, units: str) -> tuple[float, str]:
     entries = [scene.get(table, {}).get(name) for table in ("axes", "points", "fixed")]
     entries = [part for entry in entries for part in (entry.values() if isinstance(entry, dict) else [entry])]
     texts = [x for part in entries for x in (part if isinstance(part, list) else [part]) if isinstance(x, str)]
-    written_units = [written[1] for text in texts[:1] if (written := _units.split(text)) and written[1]]
-    return suitable(units, [*json.loads(dataset.attrs.get(ASKED, "[]")), *written_units])
+    # The scale of an axis is a text, too, but no number.
+    written_units = [written[1] for text in texts if (written := _units.split(text))][:1]
+    return suitable(units, [*json.loads(dataset.attrs.get(ASKED, "[]")), *filter(None, written_units)])
 
 
 def scene_of(dataset: xr.Dataset) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import xarray as xr
 import drivetrain_jax as dt
 from drivetrain_jax.cli import main
 from drivetrain_jax.report import report
-from drivetrain_jax.report.statements import statements, values_tables
+from drivetrain_jax.report.statements import axes_table, statements, values_tables
 from tests.view import results
 
 HOSTILE = "</title><script>alert(1)</script>"
@@ -104,6 +104,22 @@ def test_ranges_of_a_chart_hold_for_all_other_values():
     (sentence,) = [s for s in said if s.startswith("Stable for all values of beta at ")]
     assert f"{everywhere[0]:.6g}" in sentence and f"{everywhere[-1]:.6g}" in sentence
     assert any(s.startswith("Undecided points") for s in said)
+
+
+def test_points_without_a_value_are_no_verdicts():
+    dataset = _described(results.grid(np.array([[0, 1, 3], [3, 0, 1]]), "beta", "Omega"))
+    dataset = results.with_axes(dataset, beta=np.array([0.3, 0.1]), Omega=np.array([1.2, 1.9, 1.4]))
+    said = "\n".join(statements(dataset))
+    assert "stable 33.333 %, unstable 33.333 %, without a value 33.333 %" in said and "undecided" not in said.lower()
+    (_, rows), *_ = values_tables(dataset)
+    assert sum("no value" in row for row in rows) == 2
+    assert [row[2:4] for row in axes_table(dataset)] == [("0.1", "0.3"), ("1.2", "1.9")]
+
+
+def test_ranges_of_a_list_are_those_of_its_order():
+    dataset = _described(results.grid(np.array([[0, 0, 1]]), "beta", "Omega"))
+    dataset = results.with_axes(dataset, beta=np.array([0.3]), Omega=np.array([1.2, 1.9, 1.4]))
+    assert any(s.startswith("Stable") and "1.2, 1.9" in s for s in statements(dataset))
 
 
 def test_few_points_are_tabulated_with_their_places(files):

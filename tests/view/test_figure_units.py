@@ -61,6 +61,8 @@ def test_axes_have_the_unit_of_the_scene():
     )
     assert "joint angle ($\\beta$) [deg]" in texts(plot(chart(scene=text)))
     assert "joint angle ($\\beta$) [rad]" in texts(plot(chart(scene=text), units="rad"))
+    scaled = text.replace("{ start", '{ scale = "linear", start')
+    assert "joint angle ($\\beta$) [deg]" in texts(plot(chart(scene=scaled)))
 
 
 def test_fixed_values_have_the_unit_of_the_scene_or_of_the_axes():

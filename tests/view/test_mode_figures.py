@@ -44,6 +44,14 @@ def crossing() -> xr.Dataset:
     return result(6, natural_frequency=frequency, mode_type=kinds, branch=branch)
 
 
+def test_points_without_a_value_are_bands():
+    dataset = crossing()
+    dataset["outcome"][2] = 2
+    dataset["natural_frequency"][2] = np.nan
+    figure = plot(dataset)
+    assert "failed (1)" in [text.get_text() for box in figure.legends for text in box.get_texts()]
+
+
 def test_branches_keep_colour_and_direction_through_a_crossing():
     axes, of = plot(crossing()).axes[0], type_colours(crossing())
     curves = axes.collections
