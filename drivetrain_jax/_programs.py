@@ -122,8 +122,9 @@ def program_identity(system: type[System], analysis: Analysis, content: object) 
 
 
 def _packages(system: type[System], analysis: Analysis) -> set[str]:
-    """Names of the outermost packages, or of the scripts, that contain the code of a system and of an analysis."""
-    code = (system, *(getattr(x, "func", x) for x in (analysis.model(system).build, analysis.solvers)))
+    """Names of the outermost packages, or of the scripts, that contain the code of a system, its bases, and an analysis."""
+    bases = [base for base in system.__mro__ if issubclass(base, System)]
+    code = (*bases, *(getattr(x, "func", x) for x in (analysis.model(system).build, analysis.solvers)))
     return {str(x.__module__).partition(".")[0] for x in code}
 
 

@@ -211,6 +211,12 @@ def declared(units="1", roles=(), model=None, **serving):
     return type("Own", (System,), own | {"omega": parameter(units, "speed"), "build": build})
 
 
+def named(parameter_name):
+    """A new system with one parameter of this name."""
+    own = {"name": "own", "title": "own", "__annotations__": {parameter_name: float}}
+    return type("Own", (System,), own | {parameter_name: parameter("1", "any")})
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -239,6 +245,9 @@ def declared(units="1", roles=(), model=None, **serving):
         (lambda: dt.sweep(dt.floquet, dt.Cardan, over={"beta": [0.1]}), "system: got the class Cardan; expected a system"),
         (lambda: dt.sweep(dt.floquet, SHAFT, over={"beta": [[0.1]]}), r"axes.beta.values = \[\[0.1\]\]: expected"),
         (lambda: swept(lambda p: {"outcome": p["a"]}), "outcome: the function returns float64 of the shape"),
+        (lambda: swept(lambda p: {"y": jnp.bfloat16(p["a"])}, {"a": [0.5, 1.0]}), "returns 'y' as bfloat16; expected num"),
+        (lambda: named("values"), "Own.values: a name that every system or result has; expected another"),
+        (lambda: named("outcome"), "Own.outcome: a name that every system or result has; expected another"),
         (lambda: swept(len, {"k": [0.0, 1.0]}), r'k: an array cannot vary as a whole; expected one entry, .* "k\[0\]"'),
         (lambda: swept(len, {"l": [0.0, 1.0]}), "over.l: a list cannot vary as a whole"),
         (lambda: swept(len, {"k[3]": [0.0, 1.0]}), r"over.k\[3\]: expected k\[0\] to k\[2\]"),

@@ -41,7 +41,9 @@ _CHUNK = 32
 def whole_span(form: LinearPeriodic) -> LinearPeriodic:
     """``form`` with its span as period: the monodromy matrix is then the propagator itself."""
     if form.reversor is None or form.log_determinant is None:
-        return replace(form, reversor=None)
+        # The determinant of the monodromy matrix includes those of the matrices of a reversal.
+        known = form.log_determinant if form.reversal is None else None
+        return replace(form, reversor=None, reversal=None, log_determinant=known)
     return replace(form, reversor=None, log_determinant=Partial(_half, form.log_determinant))
 
 

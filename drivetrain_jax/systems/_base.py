@@ -361,6 +361,9 @@ class System(eqx.Module):
         for name, kind in body.get("__annotations__", {}).items():
             if name not in fields and "ClassVar" not in str(kind):
                 raise TypeError(f"{cls.__name__}.{name}: not a parameter; expected {name}: Any = parameter(...)")
+        for name in fields:
+            if hasattr(System, name) or name == "outcome":
+                raise InputError(f"{cls.__name__}.{name}: a name that every system or result has; expected another one")
         cls.parameters += tuple(replace(m[_PARAMETER], name=name) for name, m in fields.items() if _PARAMETER in m)
         # For `help`: meaning, range, unit and default of each parameter; the signature has None where there is no default.
         about = []
@@ -370,7 +373,11 @@ class System(eqx.Module):
             about.append(f"    {p.name}: {p.long_name}; {p.allowed_in_units}; {default}.")
         cls.__doc__ = "\n".join([cleandoc(body.get("__doc__") or getattr(cls, "title", "")), "", "Args:", *about])
         if "models" not in body:
-            cls.models = dict(cls.models) | {a: m for method in body.values() for a, m in _models(cls, method).items()}
+            # Methods of the base build this class, whose parameters and other methods they use.
+            marked = {a: getattr(model.build, "__wrapped__", None) for a, model in cls.models.items()}
+            inherited = {a: _models(cls, body.get(m.__name__, m), m)[a] for a, m in marked.items() if m}
+            inherited = dict(cls.models) | inherited
+            cls.models = inherited | {a: m for method in body.values() for a, m in _models(cls, method).items()}
         _check_names(cls)
         if "atlas" in cls.models and "floquet" not in cls.models:
             raise ValueError(f"models of {cls.name}: atlas needs floquet as well")
@@ -469,9 +476,9 @@ def _check_names(system: type[System]) -> None:
                 raise InputError(f"{system.__name__}: {where}: {name!r} is not a parameter{nearest(name, names)}")
 
 
-def _models(system: type[System], method: Any) -> dict[str, Model]:
-    """The models that ``method`` of ``system`` returns, by analysis."""
-    marks = getattr(method, _SERVES, {})
+def _models(system: type[System], method: Any, marked: Any = None) -> dict[str, Model]:
+    """The models that ``method`` of ``system`` returns, by analysis; it has the marks of ``marked``, which it replaces."""
+    marks = getattr(marked or method, _SERVES, {})
     if not marks:
         return {}
 
@@ -521,8 +528,10 @@ def _number(described: Parameter, value: Any) -> Any:
     whole = np.asarray(value)
     if whole.dtype.kind not in "iuf":
         raise InputError(f"{described.name}: an array of {whole.dtype}; expected numbers, {described.allowed_in_units}")
-    for extreme in (whole.min(), whole.max()) if whole.size else ():
-        described.check(float(extreme))
+    # The extremes stand for all values of a range without holes.
+    holes = described.integer or described.or_zero
+    for number in np.unique(whole) if holes else (whole.min(), whole.max()) if whole.size else ():
+        described.check(float(number))
     return value if whole.dtype.kind == "f" else whole.astype(float)
 
 

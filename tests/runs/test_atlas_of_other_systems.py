@@ -98,6 +98,11 @@ def test_traced_numbers_are_refused_in_one_line(atlas):
         jax.jit(lambda omega: atlas(omega=omega).spectral_radius.values)(1.1)
 
 
+def test_every_number_of_an_integer_is_checked():
+    with pytest.raises(InputError, match=r"order = 1\.5: expected integer"):
+        Pendulum(omega=1.0, depth=0.3, order=np.array([1, 1.5, 2]))
+
+
 def test_an_integer_is_no_range_of_an_atlas(monkeypatch):
     """Between integers the motion of this pendulum has no such period, so its multipliers mean nothing."""
     axes = {"order": {"start": 1, "stop": 3}}
@@ -117,3 +122,59 @@ def test_an_integer_has_no_sensitivity():
     point = {"omega": 1.1, "depth": 0.3, "mass": 1.0, "order": 1}
     found = dt.point("pendulum", "floquet", sensitivities=True, **point)
     assert {each.name for each in found.sensitivities} == {"omega", "depth", "mass"}
+
+
+class Rotor(Pendulum):
+    """A pendulum whose excitation is a sine, with damping."""
+
+    name = "rotor"
+    damping: float = parameter("1", "damping", default=0.02, lower=0.0)
+
+    def rows(self, tau):
+        """The rows of A."""
+        return (0, 1.0), (-(1 + self.depth * jnp.sin(tau)) / self.omega**2, -self.damping)
+
+    def floquet_model(self):
+        form = LinearPeriodic(self.rows, 2 * math.pi)
+        return FloquetModel(natural=form, reduced=form)
+
+
+def test_a_subclass_has_its_own_equations_and_parameters():
+    """An overridden method serves the same analyses; what it needs is known without repeating the marks."""
+    model = Rotor.models["floquet"]
+    assert "damping" in model.parameters
+    values = {"omega": 2.0, "depth": 0.5, "mass": 1.0, "order": 1, "damping": 0.3}
+    np.testing.assert_allclose(
+        model.build(values).reduced.matrix(0.5 * math.pi), [[0, 1], [-1.5 / 4, -0.3]], atol=1e-15
+    )
+
+
+class HalfPeriod(System):
+    """x'' + 2 d x' + (a - 2 q cos 2t) x = 0 over half a period, the rest by reversal."""
+
+    name = "half_period"
+    title = "Mathieu's equation by halves"
+    a: float = parameter("1", "stiffness")
+    q: float = parameter("1", "modulation")
+    d: float = parameter("1", "damping")
+
+    def rows(self, t):
+        return (0, 1.0), (2 * self.q * jnp.cos(2 * t) - self.a, -2 * self.d)
+
+    def reversal(self):
+        return ((0, 1.0), (1.0, -2 * self.d)), ((2 * self.d, 1.0), (1.0, 0))
+
+    @serves("floquet", "atlas")
+    def floquet_model(self):
+        half = LinearPeriodic(self.rows, math.pi / 2, reversal=self.reversal)
+        return FloquetModel(natural=LinearPeriodic(self.rows, math.pi), reduced=half)
+
+
+@pytest.mark.full
+def test_an_atlas_of_a_form_with_a_reversal_has_the_values_of_solves(monkeypatch):
+    monkeypatch.setitem(systems._REGISTERED, "half_period", HalfPeriod)
+    axes = {"a": {"start": 0.5, "stop": 1.5}, "q": {"start": 0.1, "stop": 0.4}}
+    atlas = dt.open_atlas(dt.run({"system": "half_period", "analysis": "atlas", "axes": axes, "fixed": {"d": 0.05}}))
+    found = atlas(a=[1.0, 1.3], q=[0.3, 0.2])
+    np.testing.assert_allclose(found.spectral_radius, [1.36305001, 0.85463600], rtol=1e-8)
+    assert (found.spectral_radius_error < 1e-10).all() and len(atlas.stability.atlas.panels) == 1
