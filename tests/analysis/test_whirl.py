@@ -294,6 +294,23 @@ def test_a_point_begins_with_whirl_and_critical_speeds():
     assert "with the gyroscopic effect" in repr(found)
 
 
+@pytest.mark.full
+def test_equal_planes_whirl_as_one():
+    """At rest every frequency is double, and no sense of a pair is that of the other."""
+    shaft = {
+        "length": [0.3, 0.5],
+        "EI": [3e3, 2e3],
+        "rhoA": [2.0, 3.0],
+        "k_A": 1e5,
+        "k_D": 2e5,
+        "Ip_A": 2e-3,
+        "I_A": 1e-3,
+    }
+    one, two = (dt.point("bicardan", "whirl", modes=8, speed=0.0, **shaft, **more) for more in ({}, {"k_A_y": 1e5}))
+    np.testing.assert_allclose(two.whirl_frequency, one.whirl_frequency, rtol=1e-12)
+    np.testing.assert_array_equal(two.whirl_direction, one.whirl_direction)
+
+
 def test_wrong_input_is_one_line():
     rotor = {"length": (0.5, 0.5), "EI": (1e4,) * 2, "rhoA": (1.0, 0.0), "k_A": 1e6, "k_D": 1e6}
     cases: tuple[tuple[dict[str, Any], dict[str, Any], str], ...] = (

@@ -221,7 +221,7 @@ def frequency_derivatives(build: Callable[[Any], Shaft], parameters: Any, q: Arr
     along_q, along = (
         jnp.take_along_axis(x, i, axis=0)[0] for x, i in ((along_q, section), (along, section[..., None]))
     )
-    none = _multiple(shaft, q) | ~jnp.isfinite(q)
+    none = multiple(shaft, q) | ~jnp.isfinite(q)
     slope = jnp.where(none[:, None], jnp.nan, -2 * safe[:, None] * along / along_q[:, None])
 
     def missing(parameters: Any) -> Array:
@@ -234,13 +234,18 @@ def frequency_derivatives(build: Callable[[Any], Shaft], parameters: Any, q: Arr
     return jnp.where(q == 0, jnp.where(held[:, None], jnp.nan, 0.0), slope.T).T
 
 
-def _multiple(shaft: Shaft, q: Array) -> Array:
-    """Flags of the frequencies that agree with a neighbour to rounding, including the one after the last."""
+def follows(q: Array) -> Array:
+    """Flags of the frequencies that agree with the one before to rounding."""
     near = q[1:] - q[:-1] <= _MULTIPLE * q[1:]
-    none = jnp.zeros_like(q[:1], bool)
+    return jnp.concatenate([jnp.zeros_like(q[:1], bool), near])
+
+
+def multiple(shaft: Shaft, q: Array) -> Array:
+    """Flags of the frequencies that agree with a neighbour to rounding, including the one after the last."""
+    after = follows(q)
     above = jnp.where((q[-1:] > 0) & jnp.isfinite(q[-1:]), q[-1:] * (1 + _MULTIPLE), 1.0)
     beyond = (q[-1:] > 0) & (_characteristic(shaft)(shaft, above).count > len(q))
-    return jnp.concatenate([none, near]) | jnp.concatenate([near, beyond])
+    return after | jnp.concatenate([after[1:], beyond])
 
 
 def relative_error(shaft: Shaft, roots: Roots) -> Array:

@@ -24,7 +24,13 @@ from drivetrain_jax._quantities import Dimension, Variable, count
 from drivetrain_jax.analysis._base import Analysis, Request, Solver
 from drivetrain_jax.analysis.critical_speeds import coupled
 from drivetrain_jax.analysis.critical_speeds.analysis import Build, outcomes
-from drivetrain_jax.analysis.critical_speeds.frequency_roots import Roots, find_roots, frequency_derivatives
+from drivetrain_jax.analysis.critical_speeds.frequency_roots import (
+    Roots,
+    find_roots,
+    follows,
+    frequency_derivatives,
+    multiple,
+)
 from drivetrain_jax.analysis.numerics.lanes import Constants
 from drivetrain_jax.systems import Shaft, System
 
@@ -49,6 +55,11 @@ def _whirl(shaft: Shaft, modes: int) -> tuple[Roots, Array]:
         moving = (roots.q > 0) & jnp.isfinite(roots.q)
         direction = coupled.directions(shaft, jnp.where(moving, roots.q, 1.0))
         codes = jnp.where(direction > _PLANAR, FORWARD, jnp.where(direction < -_PLANAR, BACKWARD, PLANAR))
+        # Any combination of modes of one frequency is a mode: the extreme ones whirl in opposite senses.
+        number = jnp.arange(modes).reshape(modes, *(1,) * (roots.q.ndim - 1))
+        place = number - jax.lax.cummax(jnp.where(follows(roots.q), 0, number))
+        pair = multiple(shaft, roots.q) & (codes != PLANAR)
+        codes = jnp.where(pair, jnp.where(place % 2 == 0, BACKWARD, FORWARD), codes)
         return roots, jnp.where(moving, codes, PLANAR)
     pair = jax.tree.map(lambda field: jnp.stack([field, field], axis=-1), shaft.spread())
     if pair.spin is not None:
