@@ -83,6 +83,7 @@ def pack(stored: StoredAtlas) -> dict[str, Any]:
         "reversor": None if form.reversor is None else np.ravel(form.reversor).tolist(),
         "closed_form": stability.closed_form,
         "hamiltonian": _hamiltonian(atlas, stability.build),
+        "symplectic": _model(atlas, stability.build, _inside(atlas, 1)).hamiltonian is not None,
         "time": _time(stability.build, atlas, system),
         "panels": [_panel(atlas, panel, stability.build) for panel in atlas.panels],
         "gaps": boxes,
@@ -182,8 +183,7 @@ def _hamiltonian(atlas: Atlas, build: Callable[..., FloquetModel]) -> bool | lis
     """True if the system is Hamiltonian everywhere, or the parameters and values that make it so."""
 
     def everywhere(points: np.ndarray) -> bool:
-        hamiltonian = _model(atlas, build, points).hamiltonian
-        return hamiltonian is not None and bool(np.all(hamiltonian()))
+        return bool(np.all(_model(atlas, build, points).is_hamiltonian()))
 
     points = _inside(atlas)
     if everywhere(points):

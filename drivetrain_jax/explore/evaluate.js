@@ -1,5 +1,5 @@
 // An atlas as a function: panels, points, slices. Python: atlas/panels.py, atlas/stability.py.
-import { EPS, characteristic, eigenvalues, product, radiusBound } from "./linear.js";
+import { EPS, allOnCircle, characteristic, eigenvalues, product, radiusBound } from "./linear.js";
 import { conservativeVerdict, invariants, nothingCrosses, radius } from "./quartic.js";
 
 // Relative tolerance for points outside a box by rounding of their coordinate.
@@ -154,7 +154,7 @@ export function isHamiltonian(atlas, values) {
 }
 
 /** Results of `phi` by the eigenvalues of Z. */
-function byEigenvalues(atlas, panel, phi, log) {
+function byEigenvalues(atlas, panel, phi, log, hamiltonian) {
   const n = atlas.size;
   let z = phi;
   if (atlas.reversor) {
@@ -170,7 +170,10 @@ function byEigenvalues(atlas, panel, phi, log) {
   // The exact determinant has no error.
   for (let k = 0; k < (log === null ? n : n - 1); k++) relative = Math.max(relative, (slopes[k] * changed) / rho ** (k + 1));
   if (log !== null) relative = Math.max(relative, Math.abs(((-1) ** n * a[n - 1] - Math.exp(log)) / rho ** n));
-  const bound = radiusBound(re, im, relative + (8 * EPS * square ** (atlas.halves / 2)) / rho);
+  relative += (8 * EPS * square ** (atlas.halves / 2)) / rho;
+  // Bounded motion without damping: all multipliers lie on the unit circle.
+  if (hamiltonian && allOnCircle(re, im, relative)) return { spectral_radius: 1, spectral_radius_error: 4 * EPS, verdict: STABLE };
+  const bound = radiusBound(re, im, relative);
   return { spectral_radius: rho, spectral_radius_error: bound, verdict: decide(rho, bound) };
 }
 
@@ -183,18 +186,18 @@ export const determinantError = (log, error) => 8 * EPS * (1 + Math.abs(log)) + 
 
 /** Results from Phi (n x n entries by rows) and log det Z at one point of a panel. */
 export function judge(atlas, panel, phi, log, hamiltonian) {
-  if (!atlas.closed_form) return byEigenvalues(atlas, panel, phi, log);
+  if (!atlas.closed_form) return byEigenvalues(atlas, panel, phi, log, hamiltonian);
   invariants(phi, 0, work, panel.value_error);
   const [e1, e2, e3] = work;
   const d = [work[3] + work[6], work[4] + work[7], work[5] + work[8], determinantError(log, panel.log.error) * Math.exp(log)];
   radius(e1, e2, e3, Math.exp(log / 4), ...d, three);
   let [rho, error, wide] = three, verdict = decide(rho, error);
   if ((wide && error > 4 * EPS) || !(Math.abs(rho - 1) > error)) {
-    const better = byEigenvalues(atlas, panel, phi, log);
+    const better = byEigenvalues(atlas, panel, phi, log, hamiltonian);
     ({ spectral_radius: rho, spectral_radius_error: error, verdict } = better);
     if (verdict === UNDECIDED && nothingCrosses(e1, e2, e3, log, ...d)) verdict = rho < 1 ? STABLE : UNSTABLE;
   }
-  if (hamiltonian) {
+  if (hamiltonian && atlas.symplectic) {
     verdict = conservativeVerdict(phi, 0, panel.value_error);
     // Bounded motion without damping: all multipliers lie on the unit circle.
     if (verdict === STABLE) [rho, error] = [1, 4 * EPS];

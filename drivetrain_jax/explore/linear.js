@@ -139,6 +139,23 @@ export function eigenvalues(a, n) {
   return [x, y];
 }
 
+/** True if all multipliers without damping are simple and on the unit circle; `error` is that of a_k in units of rho^k. */
+export function allOnCircle(re, im, error) {
+  const moduli = Array.from(re, (x, i) => Math.hypot(x, im[i])), rho = Math.max(...moduli);
+  const gap = (i, j) => Math.hypot(re[i] - re[j], im[i] - im[j]);
+  const radii = moduli.map((modulus, i) => {
+    const holds = (r) => {
+      let all = 1, eps = 0;
+      for (let j = 0; j < re.length; j++) (all *= Math.abs(gap(i, j) / rho - r)), (eps = eps * (modulus / rho + r) + error);
+      return all > eps;
+    };
+    return rho * ((LADDER.find(holds) ?? Infinity) + 4 * EPS);
+  });
+  // Four radii about a multiplier at the unit circle contain the reflection of its circle if that is below 0.1.
+  const apart = (i) => radii.every((radius, j) => i === j || gap(i, j) > 4 * radii[i] + radius);
+  return moduli.every((modulus, i) => radii[i] < 0.1 && Math.abs(modulus - 1) <= radii[i] && apart(i));
+}
+
 /** Bound of the error of the largest modulus of the multipliers; `error` is that of a_k in units of rho^k. */
 export function radiusBound(re, im, error) {
   const n = re.length, moduli = re.map((x, i) => Math.hypot(x, im[i]));

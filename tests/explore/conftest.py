@@ -39,6 +39,7 @@ SCENES: dict[str, dict[str, Any]] = {
         "fixed": {"zeta": 0.01},
     },
 }
+SCENES["undamped"] = SCENES["mathieu"] | {"fixed": {"zeta": 0.0}}
 NODE = shutil.which("node")
 SCRIPT = Path(__file__).parent / "ask.mjs"
 

@@ -58,7 +58,7 @@ def agree(ours, theirs):
     return int(((verdict != UNDECIDED) & (theirs[2] == UNDECIDED)).sum())
 
 
-@pytest.mark.parametrize("name", full_after(1, ["two", "one", "mathieu", "three", "four"]))
+@pytest.mark.parametrize("name", full_after(1, ["two", "one", "mathieu", "undamped", "three", "four"]))
 def test_points_have_the_values_and_verdicts_of_python(atlases, pages, tmp_path, name):
     points = chosen(atlases(name), 500, 100)
     lost = agree(columns(atlases(name), points), by_node(pages(name), points, tmp_path))
