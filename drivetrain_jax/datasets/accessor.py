@@ -51,7 +51,12 @@ class DrivetrainAccessor:
         # Local import: it takes a third of a second.
         import pandas as pd
 
-        return pd.DataFrame({name: np.ravel(values) for name, values in _columns(self._dataset)})
+        columns: dict[str, np.ndarray] = {}
+        for name, values in _columns(self._dataset):
+            if name in columns:
+                raise InputError(f"table: {name!r} names two columns; expected results of other names (rename one)")
+            columns[name] = np.ravel(values)
+        return pd.DataFrame(columns)
 
     def verify(self) -> Report:
         """The report on the rules of the analysis and on the checksums of the file.

@@ -209,8 +209,10 @@ def _content(source: str | Path | xr.Dataset, label: str) -> tuple[dict[str, np.
         arrays = {n: dataset[n].values for n in (*_VARIABLES, "parameter", "gap_reason") if n in dataset}
     if attrs.get("analysis") != ANALYSIS.name:
         raise InputError(f"{label}: holds the analysis {attrs.get('analysis')!r}; expected an atlas")
-    if changed:
-        raise InputError(f"{label}: damaged ({checksums.named(changed)}); restore it or run it again")
+    # Every file of a run has checksums and a digest.
+    if changed or (path and changed is None and "digest" in attrs):
+        what = checksums.named(changed) if changed else "its checksums are gone"
+        raise InputError(f"{label}: damaged ({what}); restore it or run it again")
     return arrays, attrs
 
 

@@ -237,6 +237,8 @@ def _named(result: Any, name: str) -> dict[str, Array]:
         if not _STORED_NAME.fullmatch(str(key)) or key in _RESERVED:
             raise InputError(f"function: returns a result {key!r}; expected another name, without /")
         array = arrays[str(key)]
+        if getattr(array.dtype, "kind", "") not in tuple("biufc"):
+            raise InputError(f"function: returns {key!r} as {array.dtype}; expected numbers that files can store")
         if key == OUTCOME.name and (array.ndim or not jnp.issubdtype(array.dtype, jnp.integer)):
             allowed = f"expected one integer, a code of the outcome from 0 to {max(Outcome)}, or another name"
             raise InputError(f"outcome: the function returns {array.dtype} of the shape {array.shape}; {allowed}")

@@ -53,6 +53,8 @@ def choose_atlas(scene: Scene) -> tuple[Ranges, int | None] | None:
         refused = f"axes.{several.shown.name} changes {names} together; expected auto and direct"
     elif whole := next((name for name in ranges if scene.system.parameter(entry_of(name)[0]).integer), ""):
         refused = f"{whole} is an integer; expected auto and direct"
+    elif listed := next((name for name in ranges if entry_of(name)[1] is not None), ""):
+        refused = f"{listed} is an entry of a list; expected auto and direct"
     elif len(ranges) > MAX_RANGES:
         refused = f"the scene varies {len(ranges)} parameters; expected at most {MAX_RANGES}"
     if refused and requested:

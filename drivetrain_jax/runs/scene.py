@@ -303,9 +303,10 @@ def axes_of(
             raise InputError(f"{where}.{name}: a list cannot vary as a whole; {one}")
         if entry is not None and not parameter.listed:
             raise InputError(f"{where}.{name}: {base} is not a list; expected {base}")
-        if analysis.continuous and parameter.integer:
+        if analysis.continuous and (parameter.integer or entry is not None):
+            what = "an integer" if parameter.integer else "an entry of a list"
             allowed = f"expected for {analysis.name} a parameter with a continuous range"
-            raise InputError(f"axes.{name}: an integer; {allowed}")
+            raise InputError(f"axes.{name}: {what}; {allowed}")
         if points and not isinstance(keys, list):
             raise InputError(f"points.{name} = {shown(keys)}: expected a list of numbers")
         # The unit of physical data is that of the scene.

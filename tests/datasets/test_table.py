@@ -32,6 +32,12 @@ def test_every_number_is_in_its_column(file):
     assert list(dataset.drivetrain.table().columns) == list(found.columns)
 
 
+def test_two_results_are_never_one_column():
+    chart = dt.sweep(lambda p: {"y": np.array([1, 2]) * p["x"], "y_1": p["x"]}, {"x": 0.0}, over={"x": [1.0, 2.0]})
+    with pytest.raises(dt.InputError, match="table: 'y_1' names two columns"):
+        chart.drivetrain.table()
+
+
 @pytest.mark.full
 def test_complex_numbers_have_two_columns(tmp_path):
     shaft = dt.Cardan(beta=0.3, Omega=1.4, zeta=0.001, alpha=1.0, mu=1.0, gamma=100.0)

@@ -601,6 +601,10 @@ def test_damaged_panels_are_refused(file, tmp_path, capsys):
     assert not figure.exists()
     with pytest.raises(InputError, match=r"damaged \(coefficients"):
         dt.open_atlas(damaged)
+    with h5py.File(damaged, "r+") as store:
+        del store.attrs["checksums"]
+    with pytest.raises(InputError, match=r"damaged \(its checksums are gone\)"):
+        dt.open_atlas(damaged)
 
 
 @pytest.mark.parametrize(
