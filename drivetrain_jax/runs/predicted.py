@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.resonances import BUILT_IN
 from drivetrain_jax.view.style import is_joined, parameters, scene_key
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 LABELS = "resonance"
 
@@ -19,6 +22,9 @@ def resonances(dataset: xr.Dataset) -> xr.DataArray | None:
 
     Returns: ``resonance_AXIS``; its dimensions are the axes that the predictions depend on, then ``resonance`` (labels).
     """
+    # Local import: points over no range need no xarray.
+    import xarray as xr
+
     predicted = BUILT_IN.get(system := str(dataset.attrs.get("system")))
     if system not in BUILT_IN:
         # Local import: the module imports jax.
