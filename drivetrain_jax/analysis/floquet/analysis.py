@@ -23,6 +23,7 @@ from drivetrain_jax.analysis._base import DIFFRAX_SOLVERS, RTOL, Analysis, Reque
 from drivetrain_jax.analysis.floquet.direct import Monodromy
 from drivetrain_jax.analysis.floquet.effort import (
     MAX_PANELS,
+    fades,
     fastest_rate,
     panels_needed,
     strongly_damped,
@@ -37,7 +38,8 @@ if TYPE_CHECKING:
     from drivetrain_jax.systems import FloquetModel, LinearPeriodic
 
 # Ratio of the panels of the two solutions behind an error estimate, and the loosest target for it. The ratio needs a system
-# that predicts its panels: elsewhere so few panels may not show the order of the scheme.
+# that predicts its panels, and modes that do not fade within them: elsewhere so few panels may not show the order of the
+# scheme.
 _RATIO, _FINE = 4, 1e-8
 # Most panels for small multipliers.
 _MOST_FACTORS = 4096
@@ -71,7 +73,9 @@ def direct_solvers(
             from drivetrain_jax.analysis.floquet.propagator import factored, monodromy
 
             model, lanes = build(values), lane_count(values)
-            ratio = jnp.where(target <= _FINE, _RATIO, 2) if model.panels is not None else 2
+            ratio: Any = 2
+            if model.panels is not None:
+                ratio = jnp.where((target <= _FINE) & ~fades(model.reduced, panels), _RATIO, 2)
 
             def one(point: Mapping[str, Any], panels: Array) -> Monodromy:
                 return monodromy(form(build(point)), panels, target, ratio, lanes, small)

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 MAX_PANELS, MAX_STEPS = 400_000, 1_000_000
 # Panels of a model that is NaN somewhere in its span: it is solved all the same, so that its outcome becomes NOT_FINITE.
 _TO_FIND_NO_VALUE = 16
+# Mean decay in a panel up to which Gauss collocation has its full order.
+_FADING = 0.1
 # Steps of order 8 as accurate as one panel, and the decay in a step with which explicit schemes are stable.
 STEPS, _STABLE = 2.5, 6.0
 
@@ -74,12 +76,23 @@ def _decay(build: Build, values: Mapping[str, Any]) -> Array:
     return _decay_of(build(values).reduced)
 
 
+def fades(system: LinearPeriodic, panels: Array) -> Array:
+    """True if modes of any lane decay within panels so fast that the scheme has less than its order."""
+    decay = _decays(system)
+    mean = jnp.mean(decay, axis=0) if decay.ndim > 1 else decay
+    return jnp.nanmax(mean, initial=0.0) > _FADING * panels
+
+
 def _decay_of(system: LinearPeriodic) -> Array:
     """The span times the largest ``-tr A`` at 5 instants, of all lanes."""
+    return jnp.nanmax(_decays(system), initial=0.0)
+
+
+def _decays(system: LinearPeriodic) -> Array:
     # Only the diagonal is used: the compiler drops the other entries.
     entries = system.entries(*system.basis(jnp.arange(5)[:, None] * system.span / 4))
     rate = -sum((entry for (i, j), entry in entries.items() if i == j), jnp.zeros(()))
-    return jnp.nanmax(rate * system.span, initial=0.0)
+    return rate * system.span
 
 
 def fastest_rate(system: LinearPeriodic) -> Array:

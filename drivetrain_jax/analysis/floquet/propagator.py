@@ -152,8 +152,6 @@ _SMALL_TRUNCATION = 1e-9
 _UNDAMPED = 2.0 * STAGES * (STAGES + 1)
 # Angle of an oscillation in a panel beyond which two numbers of panels may agree by accident.
 _RESOLVED = 4.0
-# Decay in a panel up to which the scheme has its full order.
-_FADING = 0.1
 # Decay over the span beyond which damping is strong.
 _STRONG = 8.0
 # Periods of the iteration for small multipliers, and the largest logarithm of a ratio in it.
@@ -373,10 +371,8 @@ def _agreeing(
         missed = (fine.stiffness > _RESOLVED * count) & (fine.decay < fine.stiffness)
         undamped = jnp.where(fine.decay > 0, -_UNDAMPED * (1.0 * count) ** 2 / fine.decay, -jnp.inf)
         fine = fine._replace(undamped=jnp.where(missed, jnp.inf, undamped))
-        # Half as many panels may not show the order yet, unless the system predicts how many it needs, and modes that decay
-        # within panels lower it: count on less.
-        full = (ratio > 2) & (fine.decay < _FADING * count)
-        gain = jnp.where(number == 1, count / first, 2.0) ** jnp.where(full, ORDER, ORDER - 3)
+        # Half as many panels may not show the order yet, unless the system predicts how many it needs: count on less.
+        gain = jnp.where(number == 1, count / first, 2.0) ** jnp.where(ratio > 2, ORDER, ORDER - 3)
         z = jax.lax.cond(
             number > 0, lambda: compare(ends, determinant, coarse, fine, len(marches) * count, gain, rtol), lambda: none
         )
