@@ -114,7 +114,8 @@ class Budget:
         seconds = (seconds + cpu(resource.RUSAGE_CHILDREN) - children) / statistics.median(self.units[-5:])
         if seconds > NOISE * LONGEST and not any(item.get_closest_marker(name) for name in ("full", "docs")):
             pytest.fail(
-                f"{seconds:.1f} reference seconds, expected at most {LONGEST}: shorten or mark full", pytrace=False
+                f"{seconds:.1f} reference seconds, expected at most {NOISE * LONGEST}: shorten or mark full",
+                pytrace=False,
             )
         return result
 

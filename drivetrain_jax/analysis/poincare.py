@@ -252,8 +252,8 @@ def measures(flow: Flow, states: Array, request: Request) -> dict[str, Array]:
         results["distinct_points"] = distinct.astype(jnp.int32)
     if "chaos_k01" in request.outputs:
         last = states[-_SAMPLES:, kept]
-        known = jnp.all(jnp.isfinite(last), axis=(0, 1)) & (len(last) >= _FEWEST_SAMPLES)
-        k01 = jnp.where(known, largest_k01(last), jnp.nan)
+        k01 = largest_k01(last) if len(last) >= _FEWEST_SAMPLES else jnp.nan
+        k01 = jnp.where(jnp.all(jnp.isfinite(last), axis=(0, 1)), k01, jnp.nan)
         # The limit 0 if the section repeats: a short record of few points may look like diffusion.
         results["chaos_k01"] = jnp.where(distinct > 0, 0.0, k01)
     return results

@@ -243,7 +243,14 @@ def axes_table(dataset: xr.Dataset) -> list[tuple[str, ...]]:
     axes = [dataset[d] for d in dataset["outcome"].dims if d in dataset.coords]
     columns = [c for c in dataset.coords.values() if c.dims == ("point",) and c.name != "point"]
     return [
-        (scene_key(c), c.attrs.get("long_name", ""), *map(digits, _ends(c.values)), units_of(c), str(c.size))
+        (
+            scene_key(c),
+            c.attrs.get("long_name", ""),
+            digits(c.min().item()),
+            digits(c.max().item()),
+            units_of(c),
+            str(c.size),
+        )
         for c in (columns or axes)
         if c.size and c.dtype.kind in "fiu"
     ]
@@ -257,10 +264,6 @@ def fixed_table(dataset: xr.Dataset) -> list[tuple[str, ...]]:
         factor, units = unit_of(dataset, name, entry.get("units", "1"))
         rows.append((name, entry.get("long_name", ""), digits(_times(entry["value"], factor)), written_units(units)))
     return rows
-
-
-def _ends(values: np.ndarray) -> tuple[Any, Any]:
-    return values.min(), values.max()
 
 
 # Lists of a driveline in its drawing, each with the entry that stands for nothing.

@@ -44,11 +44,9 @@ if TYPE_CHECKING:
 View = tuple[Parameter, Callable[[Any], Any]]
 # Relative tolerance within which a value equals a fixed parameter of an atlas.
 SAME_FIXED = 5e-4
-
-
 # Relative tolerance within which a value equals an end of a range: values converted from other units, or copied from a
 # message, are rounded.
-SAME_END = 1e-9
+_SAME_END = 1e-9
 
 
 def moved_within(value: Any, ends: tuple[float, float]) -> Any:
@@ -57,7 +55,7 @@ def moved_within(value: Any, ends: tuple[float, float]) -> Any:
         return tuple(moved_within(number, ends) for number in value)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return value
-    return next((end for end in ends if math.isclose(value, end, rel_tol=SAME_END)), value)
+    return next((end for end in ends if math.isclose(value, end, rel_tol=_SAME_END)), value)
 
 
 def check_same(name: str, value: Any, fixed: float, source: str = "", units: str = "1") -> None:
@@ -308,7 +306,7 @@ class StoredAtlas:
         outside = ~((numbers >= low) & (numbers <= high))
         if outside.any():
             ends = np.where(numbers < low, low, high)
-            same = outside & np.isclose(numbers, ends, rtol=SAME_END, atol=0)
+            same = outside & np.isclose(numbers, ends, rtol=_SAME_END, atol=0)
             numbers, outside = np.where(same, ends, numbers), outside & ~same
         if outside.any():
             shown, value = self.viewed_as(name, numbers[outside].flat[0])

@@ -64,7 +64,7 @@ def test_folds_and_doublings_of_a_map():
     ],
 )
 def test_doublings_of_a_narrow_tongue_are_found(beta, zeta, expected):
-    """Where ``floquet`` of the equilibrium has its edges, to the small motion about it."""
+    """They are the edges that ``floquet`` of the equilibrium has, but for the small motion about it."""
     fixed = {"beta": beta, "zeta": zeta, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
     axes = {"Omega": {"start": 1.35, "stop": 1.5, "num": 4}}
     found = dt.run({"system": "cardan", "analysis": "frequency_response", "axes": axes, "fixed": fixed})
