@@ -93,8 +93,9 @@ def direct_solvers(
         )  # fmt: skip
 
     def effort(columns: Mapping[str, Any], strong: bool) -> np.ndarray:
-        panels = panels_needed(system, columns, rtol)
-        return np.where(strongly_damped(system, columns) == strong, panels, np.inf) if damped else panels
+        own = strongly_damped(system, columns) == strong if damped else True
+        # A chart seldom needs both solvers.
+        return np.where(own, panels_needed(system, columns, rtol) if np.any(own) else np.inf, np.inf)
 
     plain = solver("", form, lambda columns: effort(columns, False))
     strong = solver(
