@@ -237,10 +237,11 @@ def block_size(solvers: Sequence[Solver], grid: Grid) -> int:
     seconds = float(np.mean(effort * np.array([*(solver.seconds for solver in solvers), 0.0])[choice]))
     seconds *= grid.path_length
     lines = max(min(_MOST_POINTS, _MOST_BYTES // max(grid.result_bytes, 1)) // grid.path_length, 1)
+    chunk = max(solver.chunk for solver in solvers)
     least = max(solver.chunk * (1 if solver.lengthy else _LEAST_CHUNKS) for solver in solvers)
     work = min(_SECONDS, max(seconds * grid.size / _BLOCKS, _BRIEFEST))
     wanted = math.ceil(work / seconds) if seconds > work / lines else lines
-    return min(max(wanted, least), lines)
+    return min(max(wanted - wanted % chunk, least), lines)
 
 
 def make_plan(

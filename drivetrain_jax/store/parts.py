@@ -155,8 +155,7 @@ class Shards:
         room, lengths = most, []
         for axis in reversed(range(len(shape))):
             size = shape[axis]
-            # Parts of equal length, so that no shard has few points.
-            lengths.insert(0, size if axis == path else -(-size // -(-size // min(size, room))))
+            lengths.insert(0, size if axis == path else min(size, room))
             room = room if axis == path else max(1, room // size)
         return cls(shape, tuple(lengths))
 

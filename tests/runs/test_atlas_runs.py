@@ -608,7 +608,7 @@ def test_damaged_panels_are_refused(file, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("lengths", "rows"), [((3873, 5164), 448), ((173, 174), 173), ((100_000, 100), 20_032), ((5, 3000, 1500), 1024)]
+    ("lengths", "rows"), [((3873, 5164), 448), ((173, 174), 173), ((100_000, 100), 20_992), ((5, 3000, 1500), 1408)]
 )
 def test_blocks_of_a_grid_cover_it_once(lengths, rows):
     """Blocks have equal numbers of rows, whole tiles of them, except the last block."""
