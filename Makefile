@@ -12,8 +12,8 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet $(addprefix -c ,$(CONSTRAINT
 atlas: $(VENV)/installed  ## the quickstart chart, its atlas and their figure, in out/
 	@mkdir -p $(OUT)
 	$(BIN)/drivetrain run sweeps/quickstart.toml --out $(OUT)/quickstart.nc
-	$(BIN)/drivetrain run sweeps/quickstart_atlas.toml --out $(OUT)/quickstart_atlas.nc
-	$(BIN)/drivetrain plot $(OUT)/quickstart.nc $(OUT)/quickstart_atlas.nc --out $(OUT)/quickstart.png
+	$(BIN)/drivetrain run sweeps/cardan_atlas.toml --out $(OUT)/cardan_atlas.nc
+	$(BIN)/drivetrain plot $(OUT)/quickstart.nc $(OUT)/cardan_atlas.nc --out $(OUT)/quickstart.png
 
 test: $(VENV)/installed-test lint  ## all tests in their short form
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not full and not docs"

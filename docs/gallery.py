@@ -43,7 +43,7 @@ PARTS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
     }
 }
 # Charts in the range of an atlas, whose boundaries and tips are drawn over their cells: scene of the chart -> of the atlas.
-TRACED = dict.fromkeys(("quickstart", "cardan_fig2b", "cardan_fig3"), "quickstart_atlas")
+TRACED = {"quickstart": "cardan_atlas", "cardan_fig2b": "cardan_fig3_atlas", "cardan_fig3": "cardan_fig3_atlas"}
 
 
 @dataclass(frozen=True)
