@@ -75,8 +75,9 @@ class Solver:
     steps: Callable[[Mapping[str, Any]], Array] | None = None
     #: Cost of a step, relative to the other solvers.
     unit_cost: float = 1.0
-    #: Rough time of one step on one core in s, for a point (also of a path), which determines the size of blocks.
-    seconds: float = 1e-5
+    #: Rough time of one step on one core in s, for a point (also of a path). It determines the size of blocks, and up to
+    #: which number of points kernels compile without optimisation.
+    seconds: float = 2e-4
     #: Points of a batch; lines if there is a path axis.
     chunk: int = 256
     #: Integrations in time, which need other compiler options (``numerics.kernels.compiler_options``).

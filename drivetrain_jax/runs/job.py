@@ -21,7 +21,7 @@ from drivetrain_jax._machine import in_double_precision, threads, usable_cores, 
 from drivetrain_jax.analysis import OUTCOME, Outcome, Solver
 from drivetrain_jax.runs.assemble import blank
 from drivetrain_jax.runs.axes import Grid
-from drivetrain_jax.runs.kernel import FEW, LIGHT, Kernel, for_device, kernel_of
+from drivetrain_jax.runs.kernel import BRIEF, FEW, LIGHT, Kernel, for_device, kernel_of
 from drivetrain_jax.runs.scene import Problem, Scene, result_variables
 from drivetrain_jax.store.files import digest
 from drivetrain_jax.store.parts import Arrays, Shards
@@ -143,9 +143,11 @@ class Job:
     @cached_property
     def _few(self) -> bool:
         """True if the whole grid is so cheap that its kernels are not worth optimising."""
-        if self._full_size or self.total > FEW or self.boxes.count > 1:
+        if self._full_size or self.boxes.count > 1:
             return False
-        return sum(chunk.cost for chunk in self.plan(Block(0))) <= LIGHT
+        chunks = self.plan(Block(0))
+        seconds = sum(chunk.effort * self.solvers[chunk.solver].seconds * chunk.size for chunk in chunks)
+        return seconds * self.grid.path_length <= BRIEF or (self.total <= FEW and sum(chunk.cost for chunk in chunks) <= LIGHT)
 
     def prepare(self, chunks: Sequence[Chunk]) -> None:
         """Start compiling the kernels of ``chunks`` in parallel, without waiting."""

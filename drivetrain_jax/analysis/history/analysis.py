@@ -103,9 +103,9 @@ def _play_dimensions(system: type[System], request: Request, fixed: Mapping[str,
 def _play_solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     effort = partial(_effort, system, request, _MAX_PERIODS)
     if request.method == "exact":
-        return (Solver("exact", partial(_exact, system, request), effort, chunk=_PLAY_CHUNK, lengthy=True),)
+        return (Solver("exact", partial(_exact, system, request), effort, seconds=1e-5, chunk=_PLAY_CHUNK, lengthy=True),)
     solve = over_lanes(partial(_averaged, system, request))
-    return (Solver("slow flow", solve, effort, chunk=16, march=True, lengthy=True),)
+    return (Solver("slow flow", solve, effort, seconds=1e-5, chunk=16, march=True, lengthy=True),)
 
 
 def _play_derivatives(
@@ -216,7 +216,7 @@ def _outcome(flow: Flow, history: History) -> Array:
 def _solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     name = f"diffrax: {request.options['solver']}"
     solve, effort = partial(_solve, system, request), partial(_effort, system, request, limits_of(request).strobes)
-    return (Solver(name, over_lanes(solve), effort, chunk=16, march=True, lengthy=True),)
+    return (Solver(name, over_lanes(solve), effort, seconds=1e-5, chunk=16, march=True, lengthy=True),)
 
 
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
