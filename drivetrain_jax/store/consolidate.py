@@ -6,6 +6,7 @@ The writer uses h5py, because h5netcdf looks up every object for each of its pro
 
 from __future__ import annotations
 
+import io
 import mmap
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -246,13 +247,13 @@ class ResultFile:
         """
         path, entries = self._temporary, [*template.coords.values(), *template.data.values()]
         with naming(path):
-            with h5py.File("head", "w", driver="core", backing_store=False, track_order=True, libver=LIBVER) as file:
-                file.flush()
-                preface = self._preface.ljust(_USER_BLOCK, b"\0") if self._preface else b""
-                head = preface + file.id.get_file_image()
+            # An empty file in memory. The image of an open one has a wrong checksum in HDF5 1.14.4.
+            head = io.BytesIO()
+            h5py.File(head, "w", track_order=True, libver=LIBVER).close()
+            preface = self._preface.ljust(_USER_BLOCK, b"\0") if self._preface else b""
             # A pipe of this name would wait for a reader.
             path.unlink(missing_ok=True)
-            path.write_bytes(head)
+            path.write_bytes(preface + head.getvalue())
             # Space is reserved before anything is written, because HDF5 may crash the process on a full disk.
             labels = sum(len(str(value)) for value in template.attrs.values())
             _reserve(path, labels + sum(entry.values.nbytes + _LABELS for entry in entries))
