@@ -147,7 +147,8 @@ class Job:
             return False
         chunks = self.plan(Block(0))
         seconds = sum(chunk.effort * self.solvers[chunk.solver].seconds * chunk.size for chunk in chunks)
-        return seconds * self.grid.path_length <= BRIEF or (self.total <= FEW and sum(chunk.cost for chunk in chunks) <= LIGHT)
+        brief = seconds * self.grid.path_length <= BRIEF
+        return brief or (self.total <= FEW and sum(chunk.cost for chunk in chunks) <= LIGHT)
 
     def prepare(self, chunks: Sequence[Chunk]) -> None:
         """Start compiling the kernels of ``chunks`` in parallel, without waiting."""

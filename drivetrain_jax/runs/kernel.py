@@ -25,7 +25,7 @@ from drivetrain_jax.systems import System
 # LAPACK calls of XLA wait for their own thread pool, so two kernels with such calls can block each other forever (seen with
 # jax 0.10.2 on two cores).
 _LAPACK = threading.Lock()
-# Without optimisation a kernel compiles some 4 s sooner and takes two to nine times as long. It serves for a job of up to this
+# Without optimisation a kernel compiles some 4 s sooner and takes two to nine times as long. It serves jobs of up to this
 # many predicted seconds, and of up to this number of points and this predicted cost (in units of the plan).
 BRIEF, FEW, LIGHT = 0.03, 128, 3e4
 # Kernels that a process keeps, of up to 40 MB each. Every list of fixed values and every path has its own.

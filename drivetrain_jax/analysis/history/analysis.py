@@ -103,7 +103,9 @@ def _play_dimensions(system: type[System], request: Request, fixed: Mapping[str,
 def _play_solvers(system: type[System], request: Request) -> tuple[Solver, ...]:
     effort = partial(_effort, system, request, _MAX_PERIODS)
     if request.method == "exact":
-        return (Solver("exact", partial(_exact, system, request), effort, seconds=1e-5, chunk=_PLAY_CHUNK, lengthy=True),)
+        return (
+            Solver("exact", partial(_exact, system, request), effort, seconds=1e-5, chunk=_PLAY_CHUNK, lengthy=True),
+        )
     solve = over_lanes(partial(_averaged, system, request))
     return (Solver("slow flow", solve, effort, seconds=1e-5, chunk=16, march=True, lengthy=True),)
 
