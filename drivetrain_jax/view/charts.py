@@ -457,6 +457,7 @@ def maps(
         scales[name] = colours(whole, _signed(rows[0][1][0], name, whole))
         sheet.add(*(flag_entries(whole) if flags(whole) else ()))
     single, meshes = sheet.axes.size == len(rows), {}
+    named = any(flags(row[0]) for row in fields)
     titles = [[_title(part, titled) for part in parts] for _, parts in rows]
     for k, (row, (name, parts)) in enumerate(zip(fields, rows, strict=True)):
         options = scales[name][0]
@@ -466,7 +467,8 @@ def maps(
             mesh = draw_cells(axes, shown, *names, **options)
             if not flagged:
                 meshes[name] = mesh
-                sheet.add(*flag_entries(computed(part)))
+                # The entries of a variable with flags count the same points.
+                sheet.add(*(() if named else flag_entries(computed(part))))
             if name == "verdict" or _is_radius(name):
                 sheet.add(*overlays.draw_boundaries(axes, part, *names))
                 if single and k == 0:
