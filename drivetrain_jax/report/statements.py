@@ -131,10 +131,11 @@ def _about_growth(dataset: xr.Dataset) -> Iterator[str]:
     growth = growth_of(dataset)
     rates, timed = growth.from_radius(radius).transpose(*radius.dims), growth.label.endswith("[1/s]")
     place = np.unravel_index(int(np.ma.masked_invalid(rates.values).argmax()), rates.shape)
-    rate, factor = float(rates.values[place]), float(radius.values[place]) ** periods
+    # The factor per turn may underflow, or round to 1, where its logarithm does neither.
+    rate, turn = float(rates.values[place]), periods * math.log(float(radius.values[place]) or math.nan)
     if rate == 0 or not math.isfinite(rate):
         return
-    turns = math.log(2) / abs(math.log(factor))
+    factor, turns = math.exp(turn), math.log(2) / abs(turn)
     per_second, seconds = (f"{abs(rate):.4g} 1/s, ", f"{math.log(2) / abs(rate):.4g} s, ") if timed else ("", "")
     where = f" at {text}" if (text := _place(dataset, radius, tuple(map(int, place)))) else ""
     start, most, ends = "Stable means that every small disturbance dies out", "slowest", "halves"

@@ -183,6 +183,22 @@ def test_the_report_says_what_stable_means(truck):
     assert "it halves in " in said and " 1/s, by a factor 0.99" in said
 
 
+def _chart(radius: list[float], verdict: list[int]) -> xr.Dataset:
+    """Radii and verdicts of a shaft with two periods a turn, over its speed."""
+    dataset = results.with_axes(results.grid(np.array(verdict), "Omega"), Omega=1.0 + np.arange(len(radius)))
+    dataset["spectral_radius"].values[:] = radius
+    return _described(dataset).assign_attrs(periods_per_turn=2)
+
+
+def _growth(dataset: xr.Dataset) -> list[str]:
+    return [s for s in statements(dataset) if s.startswith(("Stable means", "Unstable means"))]
+
+
+def test_a_factor_per_turn_may_underflow():
+    (said,) = _growth(_chart([1e-200, 1e-250], [0, 0]))
+    assert f"it halves in {np.log(2) / (400 * np.log(10)):.4g} turns" in said
+
+
 @pytest.mark.full
 def test_the_report_compares_the_forced_motion_with_a_limit(truck):
     amplitude = np.rad2deg(dt.open_result(truck[1]).amplitude.max("shaft").values)
