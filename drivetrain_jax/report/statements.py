@@ -130,6 +130,12 @@ def _about_growth(dataset: xr.Dataset) -> Iterator[str]:
         return
     growth = growth_of(dataset)
     rates, timed = growth.from_radius(radius).transpose(*radius.dims), growth.label.endswith("[1/s]")
+    if "verdict" in dataset:
+        # An undecided radius is 1 within its error: it neither grows nor dies out.
+        decided = [code for code, word in flag_words(dataset["verdict"]).items() if word != "undecided"]
+        rates = rates.where(valid(dataset, "verdict").isin(decided))
+    if not np.isfinite(rates.values).any():
+        return
     place = np.unravel_index(int(np.ma.masked_invalid(rates.values).argmax()), rates.shape)
     # The factor per turn may underflow, or round to 1, where its logarithm does neither.
     rate, turn = float(rates.values[place]), periods * math.log(float(radius.values[place]) or math.nan)

@@ -199,6 +199,12 @@ def test_a_factor_per_turn_may_underflow():
     assert f"it halves in {np.log(2) / (400 * np.log(10)):.4g} turns" in said
 
 
+def test_an_undecided_radius_neither_grows_nor_dies_out():
+    (said,) = _growth(_chart([0.9, 1 + 1e-12], [0, 2]))
+    assert said.startswith("Stable means") and "slowest at Omega = 1:" in said
+    assert _growth(_chart([1.0, 1 + 3e-9], [0, 2])) == []
+
+
 @pytest.mark.full
 def test_the_report_compares_the_forced_motion_with_a_limit(truck):
     amplitude = np.rad2deg(dt.open_result(truck[1]).amplitude.max("shaft").values)
