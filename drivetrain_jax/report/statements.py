@@ -72,7 +72,8 @@ def _about_codes(dataset: xr.Dataset, variable: xr.DataArray, ranges: bool) -> I
     yield f"{_capital(name)} at the points computed: {parts}."
     axis = _main_axis(dataset, variable) if ranges else None
     exact = axis is not None and f"unstable_{axis.name}" in dataset.coords
-    if shares.get("undecided"):
+    # Other verdicts, such as that on a chaotic motion, are undecided for other reasons.
+    if shares.get("undecided") and "stable" in shares:
         yield "Undecided points lie closer to the limit than their error bound: compute them again with a smaller rtol."
     if axis is None:
         return

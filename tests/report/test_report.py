@@ -106,6 +106,13 @@ def test_ranges_of_a_chart_hold_for_all_other_values():
     assert any(s.startswith("Undecided points") for s in said)
 
 
+def test_an_undecided_motion_has_no_remedy_by_rtol():
+    dataset = _described(results.with_axes(results.grid(np.array([0, 2]), "zeta"), zeta=np.array([0.1, 0.2])))
+    dataset["verdict"].attrs["flag_meanings"] = "fixed_point periodic undecided"
+    said = "\n".join(statements(dataset.drop_vars("spectral_radius")))
+    assert "Undecided at zeta = 0.2." in said and "rtol" not in said
+
+
 def test_points_without_a_value_are_no_verdicts():
     dataset = _described(results.grid(np.array([[0, 1, 3], [3, 0, 1]]), "beta", "Omega"))
     dataset = results.with_axes(dataset, beta=np.array([0.3, 0.1]), Omega=np.array([1.2, 1.9, 1.4]))
