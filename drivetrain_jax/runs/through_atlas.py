@@ -216,7 +216,10 @@ def _tolerance(scene: Scene) -> float:
 def fixed_of(scene: Scene, ranges: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
     """The parameters of the propagator that are not in ``ranges``, and their values."""
     varying = [part for axis in scene.axes for part in axis.together if part.name not in ranges]
-    fixed = {**scene.fixed} | {part.name: part.values[0].item() for part in varying}
+    fixed: dict[str, Any] = {**scene.fixed}
+    for part in varying:
+        name, value, entry = part.parameter.name, part.values[0].item(), part.entry
+        fixed[name] = value if entry is None else (*fixed[name][:entry], value, *fixed[name][entry + 1 :])
     return {name: fixed[name] for name in scene.system.models[SOLVES.name].parameters if name in fixed}
 
 

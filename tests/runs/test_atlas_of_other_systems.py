@@ -16,6 +16,7 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.runs import resolve as resolve_module
 from drivetrain_jax.runs.resolve import choose_atlas
 from drivetrain_jax.runs.scene import load_scene
+from drivetrain_jax.runs.through_atlas import fixed_of
 from drivetrain_jax.systems import FloquetModel, LinearPeriodic, System, parameter, serves
 
 
@@ -115,6 +116,39 @@ def test_an_integer_is_no_range_of_an_atlas(monkeypatch):
     assert choose_atlas(load_scene(chart)) is None
     with pytest.raises(InputError, match="order is an integer; expected auto and direct"):
         choose_atlas(load_scene(chart | {"options": {"method": "atlas"}}))
+
+
+class Chain(System):
+    """A pendulum of several masses."""
+
+    name = "chain"
+    title = "Chain"
+    omega: float = parameter("rad/s", "frequency of the support", lower=0.0, open_lower=True)
+    mass: tuple = parameter("kg", "masses", lower=0.0, open_lower=True, listed=True)
+
+    @serves("atlas")
+    @serves("floquet")
+    def floquet_model(self):
+        def rows(tau):
+            return (0, 1.0), (-(1 + 0.3 * jnp.cos(tau)) / (sum(self.mass) * self.omega**2), -0.02 + 0 * self.omega)
+
+        form = LinearPeriodic(rows, 2 * math.pi)
+        return FloquetModel(natural=form, reduced=form)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        {"axes": {"omega": [0.8, 0.9, 1.0], "mass[1]": [0.5]}},
+        {"points": {"omega": [0.8, 0.9, 1.0], "mass[1]": [0.5] * 3}},
+    ],
+)
+def test_an_entry_of_one_value_takes_its_place_in_the_list(monkeypatch, points):
+    monkeypatch.setitem(systems._REGISTERED, "chain", Chain)
+    fixed, options = {"mass": [0.5, 3.0, 0.1]}, {"method": "atlas"}
+    scene = load_scene({"system": "chain", "analysis": "floquet", **points, "fixed": fixed, "options": options})
+    ranges, _ = choose_atlas(scene)
+    assert ranges == {"omega": (0.8, 1.0)} and fixed_of(scene, ranges) == {"mass": (0.5, 0.5, 0.1)}
 
 
 @pytest.mark.full
