@@ -20,10 +20,11 @@ import pytest
 
 import drivetrain_jax as dt
 from drivetrain_jax import systems
-from drivetrain_jax.analyses import _tangents
+from drivetrain_jax.analyses import Result, _tangents
 from drivetrain_jax.analysis import OUTCOME, Outcome, get_analysis
 from drivetrain_jax.analysis._base import make_request
 from drivetrain_jax.analysis.floquet import propagator
+from drivetrain_jax.invariants import check
 from drivetrain_jax.runs import kernel
 from drivetrain_jax.runs.kernel import compile_kernel, result_variables
 from drivetrain_jax.runs.resolve import resolve
@@ -426,6 +427,25 @@ def test_an_infinite_result_is_missing_and_codes_are_known():
     assert found.outcome.values.tolist() == [Outcome.NOT_FINITE, Outcome.SUCCESS]
     coded = swept(lambda p: {"r": p["a"], "outcome": jnp.where(p["a"] > 0, 300, 2)})
     assert coded.outcome.values.tolist() == [2, Outcome.NOT_FINITE]
+
+
+def test_results_agree_with_the_outcome_that_a_function_returns():
+    found = swept(
+        lambda p: {"r": 1 / (p["a"] - 1), "n": jnp.int32(3), "outcome": jnp.where(p["a"] < 0.5, 2, 1)},
+        over={"a": [0.0, 0.5, 1.0]},
+    )
+    np.testing.assert_array_equal(found.r, [np.nan, -2.0, np.nan])
+    assert found.outcome.values.tolist() == [Outcome.NOT_CONVERGED, Outcome.TOLERANCE_NOT_MET, Outcome.NOT_FINITE]
+    assert found.n.values.tolist() == [3, 3, 3]
+    assert not [finding for finding in check(found) if finding.broken]
+
+
+def test_gaps_in_the_result_of_an_analysis_stay():
+    def undamped(p):
+        return Result({"spectral_radius": p["a"], "floquet_multiplier": jnp.nan, "outcome": jnp.int8(0)})
+
+    found = swept(undamped)
+    assert found.spectral_radius.values.tolist() == [0.0, 0.5] and found.outcome.values.tolist() == [0, 0]
 
 
 @pytest.mark.full

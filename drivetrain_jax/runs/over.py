@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ from jax import Array
 
 from drivetrain_jax import analyses
 from drivetrain_jax._errors import InputError, nearest, shown
-from drivetrain_jax._quantities import Dimension, Parameter, Variable
+from drivetrain_jax._quantities import FIRST_FAILURE, Dimension, Parameter, Variable
 from drivetrain_jax.analysis import OUTCOME, Analysis, Outcome, Request, Solver, analysis_names
 from drivetrain_jax.analysis._base import dimensions_of, make_request
 from drivetrain_jax.analysis.numerics.lanes import over_lanes
@@ -64,7 +64,8 @@ def sweep(
         options: options of the analysis, or keyword arguments of the function.
 
     Returns: a dataset with one dimension for each entry of ``over``, in that order. A point with a result that is not
-    finite is NaN and has a failed ``outcome``; other points are not affected.
+    finite is NaN and has a failed ``outcome``; other points are not affected. A function may return the code ``outcome``
+    itself; from 2 (failed) on its numbers become NaN.
 
     Raises: :class:`~drivetrain_jax.InputError` for an unknown name or a value out of range, before anything is computed.
 
@@ -140,7 +141,7 @@ def _function_scene(
     name = re.sub(r"\W", "_", getattr(function, "__name__", "function")).strip("_") or "value"
     keywords = {"outputs": outputs} if results and outputs is not None else {}
 
-    def one(point: Mapping[str, Any]) -> dict[str, Array]:
+    def one(point: Mapping[str, Any]) -> dict[str, Array] | analyses.Result:
         return _named(function(replaced(system, point), **options, **keywords), name)
 
     example = {key: jax.ShapeDtypeStruct((), float) for key in values}
@@ -197,7 +198,8 @@ def _kind(
     def solve(values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
         returned = one.call({key: values[key] for key in varies})
         results = {v.name: returned[v.name].astype(v.dtype) for v in variables}
-        return _with_outcome(results, returned.get(OUTCOME.name))
+        code = dict(returned).get(OUTCOME.name)
+        return _with_outcome(results, code, isinstance(returned, analyses.Result))
 
     entries = {dim: v.name for v in variables for dim in v.dims}
     numbered = {dim: Dimension(dim, f"number of the entry of {name}", ()) for dim, name in entries.items()}
@@ -213,20 +215,26 @@ def _kind(
     return type("Function", (System,), body), Analysis(*given)
 
 
-def _with_outcome(results: Mapping[str, Array], code: Array | None) -> dict[str, Array]:
-    """``results`` and their outcome, the ``code`` of the function. Without one, all are NaN if one number is not finite."""
-    if code is not None:
-        known = (code >= 0) & (code <= max(Outcome))
-        return {**results, OUTCOME.name: jnp.where(known, code, Outcome.NOT_FINITE).astype(jnp.int8)}
+def _with_outcome(results: Mapping[str, Array], code: Array | None, of_analysis: bool) -> dict[str, Array]:
+    """``results`` and their outcome, the ``code`` of the function, 0 without one.
+
+    A success with a number that is not finite becomes a failure, and the numbers of a failure become NaN. The results
+    ``of_analysis`` stay as they are, because an analysis knows which of its numbers may be NaN.
+    """
+    state = jnp.int64(Outcome.SUCCESS) if code is None else code
+    state = jnp.where((state >= 0) & (state <= max(Outcome)), state, Outcome.NOT_FINITE).astype(jnp.int8)
+    if of_analysis:
+        return {**results, OUTCOME.name: state}
     inexact = {name for name, x in results.items() if jnp.issubdtype(x.dtype, jnp.inexact)}
     finite = jnp.all(jnp.array([True, *(jnp.all(jnp.isfinite(results[name])) for name in inexact)]))
-    state = jnp.where(finite, Outcome.SUCCESS, Outcome.NOT_FINITE).astype(jnp.int8)
-    return {n: jnp.where(finite, x, jnp.nan) if n in inexact else x for n, x in results.items()} | {OUTCOME.name: state}
+    state = jnp.where(finite | (state >= FIRST_FAILURE), state, jnp.int8(Outcome.NOT_FINITE))
+    kept = {n: jnp.where(state < FIRST_FAILURE, x, jnp.nan) if n in inexact else x for n, x in results.items()}
+    return {**kept, OUTCOME.name: state}
 
 
-def _named(result: Any, name: str) -> dict[str, Array]:
+def _named(result: Any, name: str) -> dict[str, Array] | analyses.Result:
     if isinstance(result, analyses.Result):
-        result = result.variables
+        return analyses.Result(cast("dict[str, Array]", _named(result.variables, name)))
     named, arrays = result if isinstance(result, Mapping) else {name: result}, {}
     for key, value in named.items():
         try:
