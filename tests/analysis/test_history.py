@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from types import SimpleNamespace
 
+import diffrax
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flows import lorenz
@@ -15,6 +18,8 @@ from drivetrain_jax._errors import InputError
 from drivetrain_jax.analyses import analyse
 from drivetrain_jax.analysis import Outcome, Request
 from drivetrain_jax.analysis.history import analysis as history
+from drivetrain_jax.analysis.history import integration
+from drivetrain_jax.analysis.numerics.kernels import options_for_few
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.systems import Component, Flow, System, serves
 from tests.oracles import tripod_reference as oracle
@@ -232,3 +237,15 @@ def test_a_flow_has_the_components_that_the_system_says():
 def test_a_system_without_a_state_has_no_history():
     with pytest.raises(ValueError, match="models of nameless: history needs state"):
         type("Nameless", (System,), {"name": "nameless", "flow": Lorenz.flow})
+
+
+def test_derivatives_at_whole_strobes():
+    """Where the integration stands at the requested time before it takes a step, that time moves with the period."""
+
+    def sine(w):
+        flow = Flow(lambda angles, _: (jnp.cos(angles[0]),), (0.0,), period=2 * math.pi / w, turns=(1,))
+        return integration.trajectory(flow, jnp.asarray(t), 1e-9, 1.0, diffrax.Tsit5(), integration.Limits(9, 1e4))[0]
+
+    w, t = 2 * math.pi, np.array([0.0, 0.25, 1.0, 1.5, 2.0])
+    found = jax.jit(jax.jacfwd(sine), compiler_options=options_for_few())(w)[:, 0]
+    np.testing.assert_allclose(found, t * np.cos(w * t) / w - np.sin(w * t) / w**2, atol=1e-8)

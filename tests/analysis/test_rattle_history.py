@@ -213,3 +213,13 @@ def test_a_short_part_of_a_long_period_is_computed(omega):
     other = solve_ivp(field(GEARS | {"omega": 0.0}), (0, 20), (0.5, 0.5), t_eval=times, **options)
     assert found.outcome == Outcome.SUCCESS and found.event_count == 10
     np.testing.assert_allclose(found.u, other.y[0], atol=1e-9)
+
+
+def test_derivatives_at_whole_periods():
+    """Where the march stands at the requested time before it takes a step, that time moves with the frequency."""
+    values = {"B0": 0.05, "B1": 0.3, "b": 0.1, "c": 0.2, "alpha": 0.3, "k": 1.0, "I": 1.0, "u0": 0.5}
+    at = jax.jit(lambda omega: dt.history(dt.Rattle(omega=omega, **values), times=[5.0, 8.0, 20.0]).u)
+    omega = 2 * math.pi / 5
+    found = jax.jacfwd(at)(omega)
+    expected = [(at(omega + h) - at(omega - h)) / (2 * h) for h in (1e-4, 2e-4)]
+    np.testing.assert_allclose(found, (4 * expected[0] - expected[1]) / 3, rtol=1e-6)

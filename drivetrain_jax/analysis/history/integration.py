@@ -13,6 +13,7 @@ from jax import Array
 from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import count
 from drivetrain_jax.analysis._base import Request
+from drivetrain_jax.analysis.numerics.lanes import moved_in_time
 from drivetrain_jax.systems import Flow
 
 NUM = count("num", "number of equally spaced times from 0 to stop", default=1001, lower=2, upper=1e7)
@@ -165,7 +166,10 @@ def trajectory(
 
     def to(place: _Place, target: tuple[Array, Array]) -> tuple[_Place, Array]:
         place = jax.lax.while_loop(lambda p: _ahead(p, target), lambda p: advance(p, target), place)
-        return place, jnp.where(place.healthy, place.y, jnp.nan)
+        strobe, fraction = target
+        rate = flow.period * flow.vector(strobe, fraction, place.y)
+        y = moved_in_time(place.y, rate, fraction - place.fraction)
+        return place, jnp.where(place.healthy, y, jnp.nan)
 
     start = _start(flow)
     healthy = begins & has_finite_start(flow) & few

@@ -22,6 +22,7 @@ import numpy as np
 from jax import Array
 
 from drivetrain_jax.analysis.numerics.kernels import stored
+from drivetrain_jax.analysis.numerics.lanes import moved_in_time
 from drivetrain_jax.systems import PiecewiseLinearOscillator, UnderdampedOscillator
 from drivetrain_jax.systems._models import sincos
 
@@ -467,10 +468,12 @@ def timed_motion(
             lambda w: jnp.any(active(w.motion)), lambda w: _moved(lanes, w, target, active(w.motion)), walk
         )
         late = jnp.where(walk.motion.steps < most, 0.0, jnp.nan)
-        return walk, (walk.motion.u + late, walk.motion.v + late)
+        return walk, (jnp.stack([walk.motion.u, walk.motion.v]) + late, target[1] - walk.motion.time)
 
     begin = _Walk(start(lanes, u, v, jnp.zeros(u.shape, jnp.int32)), nothing)
-    end, (high, rate) = jax.lax.scan(to, begin, (periods, (turns - periods) * lanes.period))
+    end, (states, late) = jax.lax.scan(to, begin, (periods, (turns - periods) * lanes.period))
+    states = jnp.swapaxes(states, 0, 1)
+    high, rate = moved_in_time(states, oscillator.field(turns * lanes.period, states), late)
     return high, rate, end.events, end.motion.steps >= most
 
 
