@@ -55,6 +55,20 @@ def rotated(values):
     return turn(values["low"], 2.0 - values["jump"]) @ turn(values["high"], values["jump"])
 
 
+def test_gradients_double_panels_that_are_too_few():
+    """A short pulse, which the prediction of the panels misses."""
+
+    def pulse(values):
+        def rows(t):
+            return (0, 1.0), (-0.9 - values["e"] * jnp.exp(-(((t - 1) / 0.1) ** 2)), -0.01)
+
+        form = LinearPeriodic(jax.tree_util.Partial(rows), 6.0)
+        return FloquetModel(natural=form, reduced=form)
+
+    slopes = quick_jit(lambda panels: gradients(pulse, {"e": 8.0}, panels, jnp.eye(2)[None]))
+    np.testing.assert_allclose(slopes(8), slopes(128), rtol=1e-8)
+
+
 def test_gradients_include_the_motion_of_a_jump():
     weights = jnp.array([[[1.0, -2.0], [0.3, 0.7]]])
     exact = jax.grad(lambda values: jnp.sum(weights[0] * rotated(values)))(SWING)

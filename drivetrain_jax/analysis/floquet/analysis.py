@@ -138,9 +138,10 @@ def _derivatives(
 
     build = system.models["floquet"].build
     panels = traced_panels(build, eqx.combine(parameters, constants.tree), _DERIVATIVES)
-    # Where no number would do, two panels show it soonest.
-    z, log_scale, error, pull = monodromy(build, parameters, constants, jnp.where(panels < MAX_PANELS, panels, 2))
-    sigma, by_entry, error = multipliers(jnp.where(error < _RESOLVED, z, jnp.nan), error)
+    # Where no number would do, few panels take the least time.
+    enough = panels < MAX_PANELS
+    z, log_scale, error, pull = monodromy(build, parameters, constants, jnp.where(enough, panels, 2))
+    sigma, by_entry, error = multipliers(jnp.where(enough & (error < _RESOLVED), z, jnp.nan), error)
     scale, n = jnp.exp(log_scale), len(sigma)
     unit = sigma / jnp.abs(sigma)
     # A radius that underflows has no derivative either.

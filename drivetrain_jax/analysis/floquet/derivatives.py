@@ -127,6 +127,8 @@ TIED = 1e-11
 _MATRIX_ERROR = 3e-12
 # Ratio of the errors of half as many panels and all, with three orders in reserve.
 _GAIN = 2.0 ** (ORDER - 3)
+# Change of the propagator by the last doubling of the panels, and most doublings, counted from half of the predicted panels.
+_CONVERGED, _MOST_DOUBLINGS = 1e-7, 7
 # Below this |p'(s)|, in units of the spectral radius, a multiplier s does not count as simple.
 _SIMPLE = 1e-7
 
@@ -134,16 +136,13 @@ _SIMPLE = 1e-7
 def monodromy(
     build: Build, parameters: Any, constants: Constants, panels: Array
 ) -> tuple[Array, Array, Array, Callable[[Array], Array]]:
-    """The monodromy matrix ``exp(log_scale) z`` of one point in ``panels`` panels: ``z``, ``log_scale``, error, gradient.
+    """The monodromy matrix ``exp(log_scale) z`` of one point, in at least ``panels`` panels: ``z``, ``log_scale``, error,
+    gradient.
 
     The error is the relative one of z. The last result maps ``weights`` ``(F, n, n)`` to the gradient ``(F, P)`` of
     ``sum(weights * z)`` at a fixed log_scale by ``parameters``, a pytree of P numbers.
     """
-    # Half as many panels show the error, because nothing else checks their predicted number.
-    counts = jnp.stack([(panels + 1) // 2, panels])
-    coarse, parts = jax.lax.map(partial(propagators, build, parameters, constants), counts)
-    before, phi = (reduce(lambda earlier, later: later @ earlier, factors) for factors in (coarse, parts))
-    change = jnp.linalg.norm(phi - before) / jnp.linalg.norm(phi)
+    panels, parts, phi, change = _refined(partial(propagators, build, parameters, constants), panels)
     # Scaled to 1, so that its square, Z, does not overflow.
     size = jnp.max(jnp.abs(phi))
 
@@ -167,6 +166,29 @@ def monodromy(
 
     error = jnp.maximum(_MATRIX_ERROR, halves * change / _GAIN)
     return value, halves * jnp.log(size), error, pull
+
+
+def _refined(factors: Callable[[Array], Array], panels: Array) -> tuple[Array, Array, Array, Array]:
+    """The number of panels, ``factors`` of it ``(parts, n, n)``, their product, and its relative change by a doubling.
+
+    Half of the predicted number shows the error, because nothing else checks the prediction, and so do further doublings.
+    """
+    shape = jax.eval_shape(factors, panels)
+
+    def unfinished(state: tuple[Array, ...]) -> Array:
+        doublings, count, *_, change = state
+        return (doublings < 1) | ((doublings < _MOST_DOUBLINGS) & (2 * count <= MAX_PANELS) & (change > _CONVERGED))
+
+    def double(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        doublings, count, _, before, _ = state
+        # The first time, half of the predicted number.
+        count = jnp.where(doublings < 0, (panels + 1) // 2, jnp.where(doublings == 0, panels, 2 * count))
+        parts = factors(count)
+        phi = reduce(lambda earlier, later: later @ earlier, parts)
+        return doublings + 1, count, parts, phi, jnp.linalg.norm(phi - before) / jnp.linalg.norm(phi)
+
+    start = jnp.int32(-1), panels, jnp.zeros(shape.shape), jnp.zeros(shape.shape[1:]), jnp.asarray(jnp.inf)
+    return jax.lax.while_loop(unfinished, double, start)[1:]
 
 
 def multipliers(z: Array, matrix_error: Array) -> tuple[Array, Array, Array]:
