@@ -188,7 +188,8 @@ def _refined(factors: Callable[[Array], Array], panels: Array) -> tuple[Array, A
         return doublings + 1, count, parts, phi, jnp.linalg.norm(phi - before) / jnp.linalg.norm(phi)
 
     start = jnp.int32(-1), panels, jnp.zeros(shape.shape), jnp.zeros(shape.shape[1:]), jnp.asarray(jnp.inf)
-    return jax.lax.while_loop(unfinished, double, start)[1:]
+    _, count, parts, phi, change = jax.lax.while_loop(unfinished, double, start)
+    return count, parts, phi, change
 
 
 def multipliers(z: Array, matrix_error: Array) -> tuple[Array, Array, Array]:
