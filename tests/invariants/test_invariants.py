@@ -95,6 +95,17 @@ def test_the_first_wrong_point_is_named(chart):
             {"critical_speed": real([[61.0]], "mode"), "natural_frequency": real([[1.0]], "mode")},
             "critical_speed = 60/max(|order|, 1) natural_frequency",
         ),
+        (
+            "critical_speeds",
+            {"natural_frequency": real([[5.0, 1.0, np.inf]], "mode")},
+            "natural_frequency rises along mode",
+        ),
+        ("whirl", {"whirl_frequency": real([[1.0, np.inf, 3.0]], "mode")}, "whirl_frequency rises along mode"),
+        (
+            "critical_speeds",
+            {"critical_speed": real([[np.inf]], "mode"), "natural_frequency": real([[1.0]], "mode")},
+            "critical_speed = 60/max(|order|, 1) natural_frequency",
+        ),
         ("steady_state", {"u_min": real([1.0]), "u_max": real([0.5])}, "u_min <= u_max"),
         ("steady_state", {"u_min": real([-1.0]), "u_max": real([0.5]), "u_rms": real([1.2])}, "u_rms <= max |u|"),
         ("steady_state", {"contact_fraction": real([[1.5]], "flank")}, "0 <= contact_fraction <= 1"),
@@ -140,6 +151,14 @@ def test_rules_of_the_analyses(analysis, variables, rule):
         ("lyapunov", 1, {"lyapunov_spectrum": real([[0.2]], "exponent"), "sum_rule_residual": real([5.0])}),
         ("lyapunov", 0, {"lyapunov_spectrum": real([[0.0]], "exponent"), "sum_rule_residual": real([1e-18])}),
         ("floquet", 3, {"floquet_multiplier": real(np.empty((1, 0)), "multiplier")}),
+        (
+            "critical_speeds",
+            0,
+            {
+                "critical_speed": real([[0.0, 60.0, np.inf, np.inf]], "mode"),
+                "natural_frequency": real([[0.0, 1.0, np.inf, np.inf]], "mode"),
+            },
+        ),
         ("frequency_response", 0, {"branch_amplitude": real([[[0.1, 0.3], [np.nan, np.nan]]], "branch", "shaft")}),
     ],
 )
