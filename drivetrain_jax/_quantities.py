@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError, shown
 
-_QUOTIENT = re.compile(r"\s*([+-]?\d{1,9}(?:\.\d{1,9})?)\s*/\s*([1-9]\d{0,8}(?:\.\d{1,9})?)\s*")
+_QUOTIENT = re.compile(r"\s*([+-]?\d{1,9}(?:\.\d{1,9})?)\s*/\s*(?=[\d.]*[1-9])(\d{1,9}(?:\.\d{1,9})?)\s*")
 # First code of ``outcome`` without a value.
 FIRST_FAILURE = 2
 
