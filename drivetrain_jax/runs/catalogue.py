@@ -72,6 +72,8 @@ def _analysis_lines(name: str, system: type[System]) -> list[str]:
         if method not in lacking
     ]
     lines += ["  " + line for line in aligned(methods)]
+    if not analysis.options:
+        return lines
     return [*lines, "  Options", *("  " + line for line in aligned([_parameter_row(o) for o in analysis.options]))]
 
 
