@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 
 from drivetrain_jax.analysis.numerics.linear_algebra import eigenvalues, hessenberg, matmul, solve, spectral_norm
+from tests.quick_jit import quick_jit
 
 EPS = np.finfo(float).eps
 SIZES = (1, 2, 3, 4, 5, 6)
@@ -162,3 +163,11 @@ def test_spectral_norm_of_zero_and_of_rank_one():
     assert float(norm(np.zeros((4, 4)))) == 0
     u, v = np.array([1.0, 2.0, 2.0, 4.0]), np.array([3.0, 4.0, 0.0, 0.0])
     assert float(norm(np.outer(u, v))) == pytest.approx(25.0, rel=1e-13)
+
+
+def test_derivatives_of_the_spectral_norm():
+    """They are the product of the singular vectors."""
+    a = np.random.default_rng(3).normal(size=(4, 4))
+    left, _, right = np.linalg.svd(a)
+    slope = quick_jit(jax.grad(spectral_norm))(jnp.asarray(a))
+    np.testing.assert_allclose(slope, np.outer(left[:, 0], right[0]), rtol=1e-10)

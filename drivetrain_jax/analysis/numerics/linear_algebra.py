@@ -124,11 +124,26 @@ def inertia_and_determinant(matrix: Array) -> tuple[Array, Array]:
     return negative, determinant
 
 
+@jax.custom_jvp
 def spectral_norm(a: Array) -> Array:
-    """Largest singular value of one matrix, ``(n, m) -> ()``."""
+    """Largest singular value of one matrix, ``(n, m) -> ()``; its derivative is NaN where it is a multiple one."""
     size = jnp.max(jnp.abs(a))
     scaled = a / jnp.where(size > 0, size, 1.0)
     return size * jnp.sqrt(jnp.max(eigenvalues(scaled.T @ scaled)[0]))
+
+
+@spectral_norm.defjvp
+def _spectral_norm_tangent(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    """With the projector P on the vector of the largest eigenvalue of ``a^T a``; the iteration itself has no derivative."""
+    (a,), (change,) = primals, tangents
+    norm = spectral_norm(a)
+    unit = a / norm
+    square, eye = unit.T @ unit, jnp.eye(a.shape[1])
+    others = jnp.sort(eigenvalues(square)[0])[:-1]
+    projector = eye
+    for other in others:
+        projector = projector @ (square - other * eye) / (1 - other)
+    return norm, jnp.sum(unit @ projector * change)
 
 
 def hessenberg(a: Array) -> Array:
