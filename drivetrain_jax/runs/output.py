@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 HDF5, ZARR = "hdf5", "zarr"
-# Results that the remark about missed tolerances names, and the code of the verdict that is none.
-_BOUND, _VERDICT, _UNDECIDED = "spectral_radius_error", "verdict", 2
+# Results that the remark about missed tolerances names, and the meaning of the code of a verdict that is none.
+_BOUND, _VERDICT, _UNDECIDED = "spectral_radius_error", "verdict", "undecided"
 # Endings of files of other kinds.
 _FOREIGN = {".csv", ".html", ".json", ".mat", ".npy", ".npz", ".pdf", ".png", ".svg", ".toml", ".txt", ".xlsx", ".zip"}
 
@@ -366,8 +366,11 @@ def missed(out: Path, count: int, total: int) -> str:
             axes = {dim[0].name.strip("/"): dim[0][i] for dim, i in zip(outcome.dims, place, strict=True)}
             at = ", ".join(f"{name} = {value:.6g}" for name, value in axes.items())
             text += f" (largest error bound {bounds.max():.1e}, at {at})"
-        if _VERDICT in file:
-            undecided = int((file[_VERDICT][()].reshape(-1)[places] == _UNDECIDED).sum())
+        # Analyses have verdicts of their own, with other codes.
+        meanings = file[_VERDICT].attrs.get("flag_meanings", "").split() if _VERDICT in file else []
+        if _UNDECIDED in meanings:
+            code = file[_VERDICT].attrs["flag_values"][meanings.index(_UNDECIDED)]
+            undecided = int((file[_VERDICT][()].reshape(-1)[places] == code).sum())
             text += f"; {undecided:,} of them undecided" if undecided else "; the verdicts are decided"
         text += "; direct solves (method = 'direct') have closer bounds" if "atlas_solves" in file.attrs else ""
     return f"{text}; {mark}"

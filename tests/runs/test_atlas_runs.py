@@ -644,3 +644,15 @@ def test_the_remark_about_wide_bounds_of_an_atlas_names_the_remedy(tmp_path):
         "1 of 2 values misses the tolerance 1e-09; direct solves (method = 'direct') have closer bounds; "
         "outcome = 1 marks it"
     )
+
+
+@pytest.mark.parametrize(
+    ("codes", "words"), [([2, 5, 2], "; 1 of them undecided; "), ([2, 2, 5], "; the verdicts are decided; ")]
+)
+def test_the_remark_counts_undecided_verdicts_by_their_meaning(tmp_path, codes, words):
+    """Verdicts of `lyapunov` have the code 2 for a motion that is quasi-periodic."""
+    meanings = "fixed_point periodic quasi_periodic parametrically_unstable chaotic undecided"
+    with h5py.File(tmp_path / "kinds.nc", "w") as file:
+        file["outcome"], file["verdict"] = np.array([1, 1, 0], np.int8), np.array(codes, np.int8)
+        file["verdict"].attrs.update({"flag_meanings": meanings, "flag_values": np.arange(6, dtype=np.int8)})
+    assert words in missed(tmp_path / "kinds.nc", 2, 3)
