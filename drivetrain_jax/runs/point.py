@@ -124,7 +124,8 @@ class PointResult(NamedResults):
         # Local import: most points need no proof.
         from drivetrain_jax.atlas.proof import UNDECIDED, verdict_at
 
-        code = self.values.get("verdict", UNDECIDED)
+        # Other analyses have verdicts of their own.
+        code = self.values.get("verdict", UNDECIDED) if self.analysis == "floquet" else UNDECIDED
         return code != UNDECIDED and verdict_at(get_system(self.system), self.parameters) == code
 
     def __repr__(self) -> str:
@@ -332,7 +333,8 @@ def _forced(result: PointResult, given: Mapping[str, Any], limit: Limit) -> tupl
     parameters = {name: value for name, value in given.items() if name in parameters}
     known = dict(result.values)
     for analysis, name in (("forced", "amplitude"), ("floquet", "verdict")):
-        if name not in known:
+        # The results of another analysis may have the same name: the verdict of lyapunov is a kind of motion.
+        if name not in known or result.analysis != analysis:
             known[name] = point(result.system, analysis, outputs=[name], **parameters)[name]
     return limit.at_point(known["amplitude"], int(known["verdict"]))
 

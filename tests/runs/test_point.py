@@ -11,7 +11,11 @@ import numpy as np
 import pytest
 
 import drivetrain_jax as dt
+from drivetrain_jax.analysis import Outcome
+from drivetrain_jax.atlas import proof
 from drivetrain_jax.runs import kernel
+from drivetrain_jax.runs import point as point_module
+from drivetrain_jax.runs.reply import Limit
 
 
 def test_results_by_attribute_and_name():
@@ -211,3 +215,20 @@ def test_a_range_of_a_number_without_unit():
     assert found.sentence.startswith(
         "Unstable at Omega = 1.40025 to 1.43236 (S21); the rest of Omega = 1.3 to 1.5 is stable."
     )
+
+
+def test_the_verdict_of_another_analysis_is_not_that_of_stability(monkeypatch):
+    """`lyapunov` has codes of its own: 0 is a fixed point, 3 an unstable equilibrium."""
+    shaft = {"beta": 0.3, "Omega": 1.4, "zeta": 0.001, "alpha": 1.0, "mu": 1.0, "gamma": 100.0}
+    solved = {"amplitude": np.array([0.01, 0.01]), "verdict": 1}
+    monkeypatch.setattr(point_module, "point", lambda *_, outputs, **__: {outputs[0]: solved[outputs[0]]})
+    monkeypatch.setattr(proof, "verdict_at", lambda *_: 0)
+    limit = Limit.from_text(dt.Cardan, "2 deg")
+    for analysis, code, within, proved in (
+        ("lyapunov", 3, False, False),
+        ("lyapunov", 0, False, False),
+        ("floquet", 0, True, True),
+    ):
+        result = point_module.PointResult("cardan", analysis, "", shaft, {"verdict": code}, Outcome.SUCCESS, {}, {}, {})
+        assert result.proved is proved
+        assert point_module._forced(result, shaft, limit)[1]["within"] is within
