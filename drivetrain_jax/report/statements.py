@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from drivetrain_jax.runs.reply import Limit
 
 # Results that judge the numerics or number something, so that their extremes say nothing.
-_PLAIN = ("_error", "_residual", "_number", "_certified")
+_PLAIN = ("_error", "_residual", "_number", "_certified", "_share")
 # A result of so few points is also shown as a table of all its values.
 FEW_POINTS, _FEW_VALUES = 12, 240
 
@@ -49,12 +49,12 @@ def statements(
     """
     results = [v for v in dataset.data_vars.values() if v.name != "outcome"]
     exact = [unstable_text(dataset, str(dim)) for dim in dataset["outcome"].dims] if ranges else []
-    said = [f"{_capital(text)}." for text in exact if text]
+    said = [*(f"{_capital(text)}." for text in exact if text), *_about_orders(dataset)]
     said += [sentence for v in results if "flag_meanings" in v.attrs for sentence in _about_codes(dataset, v, ranges)]
     said += [f"{_capital(dataset.attrs['proof'])}."] if "proof" in dataset.attrs else []
     said += [*_about_growth(dataset), *(_about_limit(dataset if moved is None else moved, limit) if limit else ())]
     said += [sentence for variable in results for sentence in _about_numbers(dataset, variable)]
-    return [*said, *_about_orders(dataset), *_about_outcome(dataset), *_about_errors(dataset)]
+    return [*said, *_about_outcome(dataset), *_about_errors(dataset)]
 
 
 def _about_codes(dataset: xr.Dataset, variable: xr.DataArray, ranges: bool) -> Iterator[str]:
@@ -68,6 +68,9 @@ def _about_codes(dataset: xr.Dataset, variable: xr.DataArray, ranges: bool) -> I
         return
     shares = {word.replace("_", " "): float(np.mean(variable.values == code)) for code, word in meanings.items()}
     without = float(np.mean(~np.isin(variable.values, list(meanings))))
+    if 1.0 in shares.values() and variable.ndim > dataset["outcome"].ndim:
+        # All modes are of one kind.
+        return
     parts = ", ".join(f"{word} {_share(s)}" for word, s in (*shares.items(), ("without a value", without)) if s)
     yield f"{_capital(name)} at the points computed: {parts}."
     axis = _main_axis(dataset, variable) if ranges else None

@@ -243,3 +243,10 @@ def _described(dataset: xr.Dataset) -> xr.Dataset:
     for name, words in (("verdict", "stable unstable undecided"), ("outcome", "success remark failure")):
         dataset[name].attrs |= {"flag_values": np.array([0, 1, 2], np.int8), "flag_meanings": words}
     return dataset
+
+
+def test_a_report_on_modes_of_one_kind_begins_with_the_speeds_of_the_orders():
+    chain = {"J": [1.0, 0.5, 2.0], "k": [1e4, 2e4, 3e4], "beta": [0.1, 0.0, 0.0]}
+    said = statements(dt.run({"system": "driveline", "analysis": "modes", "fixed": chain}))
+    assert said[0] == "Order 2 (joints) meets modes at 214.959, 756.706, 1639.14 rpm of the driving end."
+    assert not any("torsional" in sentence or "Share" in sentence for sentence in said)
