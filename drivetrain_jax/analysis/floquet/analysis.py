@@ -30,6 +30,7 @@ from drivetrain_jax.analysis.floquet.effort import (
     traced_panels,
 )
 from drivetrain_jax.analysis.floquet.results import VARIABLES, lacks, results
+from drivetrain_jax.analysis.numerics.kernels import count_of
 from drivetrain_jax.analysis.numerics.lanes import Constants, lane_count, over_lanes
 from drivetrain_jax.systems import System
 
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
 # that predicts its panels, and modes that do not fade within them: elsewhere so few panels may not show the order of the
 # scheme.
 _RATIO, _FINE = 4, 1e-8
+# Most panels of a single point by the small program.
+_MOST_SINGLE = 1000
 # Most panels for small multipliers.
 _MOST_FACTORS = 4096
 
@@ -67,7 +70,9 @@ def direct_solvers(
     """
     build = system.models["floquet"].build
 
-    def solver(name: str, form: Form, effort: Callable[[Mapping[str, Any]], np.ndarray]) -> Solver:
+    def solver(
+        name: str, form: Form, effort: Callable[[Mapping[str, Any]], np.ndarray], small: bool = small, cost: float = 1.0
+    ) -> Solver:
         def solve(values: Mapping[str, Any], panels: Array) -> dict[str, Array]:
             # Local import: diffrax takes as long as jax, and only tracing needs it.
             from drivetrain_jax.analysis.floquet.propagator import factored, monodromy
@@ -89,7 +94,7 @@ def direct_solvers(
 
         return Solver(
             f"direct: Gauss collocation of order 10{name}", solve, effort, lambda values: traced_panels(build, values, rtol),
-            seconds=1e-6, chunk=chunk, march=True, short_loops=True, few=few,
+            unit_cost=cost, seconds=1e-6, chunk=chunk, march=True, short_loops=True, few=few,
         )  # fmt: skip
 
     def effort(columns: Mapping[str, Any], strong: bool) -> np.ndarray:
@@ -101,7 +106,15 @@ def direct_solvers(
     strong = solver(
         ", form for strong damping", lambda model: model.damped or form(model), lambda columns: effort(columns, True)
     )
-    return (plain, strong) if damped else (plain,)
+
+    def single(columns: Mapping[str, Any]) -> np.ndarray:
+        if (count := count_of(columns)) > 1:
+            return np.full(count, np.inf)
+        panels = effort(columns, False)
+        return np.where(panels <= _MOST_SINGLE, panels, np.inf)
+
+    # One point alone waits for its program, not for its panels.
+    return (plain, strong, solver(", one point", form, single, small=True, cost=0.99)) if damped else (plain,)
 
 
 FORMS = ("reduced", "published")
