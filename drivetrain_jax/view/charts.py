@@ -64,6 +64,8 @@ _MOST_PANELS, _FEW_MAPS, _MOST_ENTRIES = 8, 4, 24
 _ROW, _LOWEST, _PAGE = 0.24, 1.3, 10.0
 # Least range of a vertical axis relative to its values.
 _LEAST_RANGE = 0.01
+# Relative change up to which a sum is a number in the legend.
+_CONSTANT = 1e-3
 # Ratio of the largest to the smallest positive value above which a colour scale is logarithmic.
 _WIDE = 3.0
 # Line styles of variables that share a panel, and number of points below which lines have markers.
@@ -668,7 +670,13 @@ def draw_lines(
                 # A band that nobody sees has no entry.
                 sheet.add(*[filled][: int(np.max(above - below, initial=0.0, where=np.isfinite(above - below)) > 1)])
         if key in _SUMMED:
-            sheet.add(*axes.plot(x, values.sum(inner, skipna=False), color=FRAME_GREY, linestyle="--", label="sum"))
+            total = values.sum(inner, skipna=False)
+            dashed: dict[str, Any] = {"color": FRAME_GREY, "linestyle": "--"}
+            # A sum that does not change would take half of the panel.
+            if np.ptp(total.values) <= _CONSTANT * np.abs(total.values).max():
+                sheet.add(Line2D([], [], **dashed, label=f"sum {total.values.mean():.4g} throughout"))
+            else:
+                sheet.add(*axes.plot(x, total, **dashed, label="sum"))
         if _is_radius(key) or key.startswith("lyapunov"):
             sheet.add(axes.axhline(0, label="limit of stability", **LIMIT))
         if dataset[key].dtype.kind in "iu":

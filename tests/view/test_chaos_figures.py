@@ -44,6 +44,13 @@ def lyapunov(**sizes: int) -> xr.Dataset:
     )  # fmt: skip
 
 
+def test_a_constant_sum_is_a_number_in_the_legend():
+    dataset = lyapunov(zeta=8)
+    spectrum = dataset["lyapunov_spectrum"]
+    dataset["lyapunov_spectrum"] = spectrum.copy(data=np.broadcast_to([1.0, -4.0], spectrum.shape))
+    assert "sum -3 throughout" in legend(plot(dataset))
+
+
 def test_curves_with_bands_and_verdicts():
     figure = plot(lyapunov(zeta=8))
     assert legend(figure) == [
