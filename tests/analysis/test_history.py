@@ -240,7 +240,7 @@ def test_a_system_without_a_state_has_no_history():
 
 
 def test_derivatives_at_whole_strobes():
-    """Where the integration stands at the requested time before it takes a step, that time moves with the period."""
+    """A requested time at which the integration already stands moves with the period."""
 
     def sine(w):
         flow = Flow(lambda angles, _: (jnp.cos(angles[0]),), (0.0,), period=2 * math.pi / w, turns=(1,))

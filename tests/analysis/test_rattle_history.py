@@ -216,7 +216,7 @@ def test_a_short_part_of_a_long_period_is_computed(omega):
 
 
 def test_derivatives_at_whole_periods():
-    """Where the march stands at the requested time before it takes a step, that time moves with the frequency."""
+    """A requested time at which the march already stands moves with the frequency."""
     values = {"B0": 0.05, "B1": 0.3, "b": 0.1, "c": 0.2, "alpha": 0.3, "k": 1.0, "I": 1.0, "u0": 0.5}
     at = jax.jit(lambda omega: dt.history(dt.Rattle(omega=omega, **values), times=[5.0, 8.0, 20.0]).u)
     omega = 2 * math.pi / 5

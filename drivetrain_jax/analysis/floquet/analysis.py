@@ -65,8 +65,8 @@ def direct_solvers(
     """The solvers that return ``results(model, monodromy, factors)`` from the monodromy matrix of ``form(model)``.
 
     ``rtol`` predicts the effort; every point is refined to the error ``target``. With ``damped`` a second solver takes the
-    points with strong damping, in the model's form for them. For ``few`` points the program is not optimised. A
-    ``small`` one compiles even sooner, and takes ten times as long to compute.
+    points with strong damping, in the model's form for them, and a third a single point of few panels. For ``few`` points
+    the program is not optimised. A ``small`` one compiles even sooner, and takes ten times as long to compute.
     """
     build = system.models["floquet"].build
 
