@@ -281,13 +281,13 @@ def _is_radius(name: object) -> bool:
 
 def colours(field: xr.DataArray, growth: Growth | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
     """Options of the cells and of the colour bar for the values of ``field``: the colours of flags; those of ``growth``,
-    which change at the limit of stability; or darker ones for larger values, logarithmic if positive values (and zeros)
-    differ widely."""
+    which change at the limit of stability, if there are values on both sides; or darker ones for larger values, logarithmic
+    if positive values (and zeros) differ widely."""
     if flags(field):
         return flag_scale(field), {}
-    if growth is None:
-        values = field.values[np.isfinite(field.values)]
-        low, high = (values.min(), values.max()) if values.size else (0.0, 1.0)
+    values = field.values[np.isfinite(field.values)]
+    low, high = (values.min(), values.max()) if values.size else (0.0, 1.0)
+    if growth is None or low * high > 0:
         positive = values[values > _ROUNDING * high]
         logarithmic = low >= 0 and positive.size > 0 and high > _WIDE * positive.min()
         norm = LogNorm(positive.min(), high) if logarithmic else Normalize(low, high)
@@ -405,6 +405,10 @@ def _small_multiples(dataset: xr.Dataset, fields: Sequence[str]) -> Figure:
     Of an axis with many values the first, middle and last are shown; with two further axes only the first of ``fields``
     that varies.
     """
+    # Flags that are the same everywhere say less than how far from a boundary the points are.
+    same = {key: codes for key in fields if flags(dataset[key]) and not np.ptp((codes := valid(dataset, key)).values)}
+    said = [f"{[*flags(codes), FAILED, PENDING][int(codes.values.flat[0])]} throughout" for codes in same.values()]
+    fields, said = ([key for key in fields if key not in same], said) if len(same) < len(fields) else (fields, [])
     names = sweep_axes(dataset)
     long = [name for name in names if dataset.sizes[name] > _FEW_MAPS]
     horizontal = horizontal_first(dataset, long if len(long) > 1 else names)[0]
@@ -418,7 +422,6 @@ def _small_multiples(dataset: xr.Dataset, fields: Sequence[str]) -> Figure:
     across, down = (_slices(dataset, name) for name in [*further, "", ""][:2])
     parts = [[part.isel(column) for column in across] for part in (dataset.isel(row) for row in down)]
     if len(further) > 1:
-        # Verdicts that are the same everywhere say less than how far from a boundary they are.
         varied = next((key for key in fields if np.ptp(valid(dataset, key).values) != 0), fields[-1])
         rows = [(varied, row) for row in parts]
     else:
@@ -428,7 +431,7 @@ def _small_multiples(dataset: xr.Dataset, fields: Sequence[str]) -> Figure:
     height = 1.8 if len(parts) > 1 else min(2.5, max(_LOWEST, _PAGE / len(rows)))
     sheet = maps(rows, (horizontal, vertical), height=height, titled=titled)
     drawn = len(across) * len(down)
-    return sheet.finish(dataset, f"{drawn} of {total} charts shown" if drawn < total else "")
+    return sheet.finish(dataset, ", ".join(said + [f"{drawn} of {total} charts shown"] * (drawn < total)))
 
 
 def _slices(dataset: xr.Dataset, name: str) -> list[dict[str, int]]:

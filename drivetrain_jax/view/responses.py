@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from typing import Any
 
 import matplotlib
@@ -153,6 +154,8 @@ def _sweeps(results: list[xr.Dataset], path: str) -> Figure:
     fit_axis(upper, "x", np.unique(np.concatenate([result[path].values for result in results])))
     labels = [f"half the peak-to-peak displacement{in_brackets(units_of(best['u_max']))}"]
     labels += [f"lag of the fundamental{in_brackets(units_of(best['phase']))}"] if with_phase else []
+    if with_phase and units_of(best["phase"]) == "rad":
+        sheet.axes[1, 0].set_yticks([0, math.pi / 2, math.pi], ["0", r"$\pi/2$", r"$\pi$"])
     sheet.label(axis_label(best[path]), *labels)
     return sheet.finish(results[0])
 

@@ -90,8 +90,9 @@ def test_only_stored_variables_get_a_panel():
 
 def test_legend_counts_what_must_not_be_overlooked():
     assert legend(plot(results.chart()))[:4] == ["stable (586)", "unstable (272)", "undecided (2)", "failed (1)"]
-    clean = results.grid(np.zeros((2, 3), int), "beta", "Omega")
-    assert legend(plot(results.with_axes(clean, beta=np.arange(2.0), Omega=np.arange(1.0, 4)))) == ["stable (6)"]
+    clean = results.grid(np.eye(2, 3, dtype=int), "beta", "Omega")
+    clean = results.with_axes(clean, beta=np.arange(2.0), Omega=np.arange(1.0, 4))
+    assert legend(plot(clean)) == ["stable (4)", "unstable (2)"]
 
 
 def test_predicted_lines_exclude_difference_combinations():
@@ -147,7 +148,7 @@ def test_four_axes_give_nine_slices():
 
 
 def test_a_range_without_a_boundary_shows_how_far_it_is_from_one():
-    """Growth below the verdicts, which are blank, with the axis of three values across."""
+    """Decay alone, on a scale from its least to its largest, with the axis of three values across."""
     dataset = results.grid(np.zeros((11, 8, 3), int), "speed", "zeta", "chi")
     axes = {
         "speed": np.linspace(2950, 3200, 11),
@@ -158,8 +159,10 @@ def test_a_range_without_a_boundary_shows_how_far_it_is_from_one():
     dataset["spectral_radius"] = dataset.spectral_radius - dataset.zeta
     figure = plot(dataset)
     assert [axes.get_title() for axes in panels(figure)[:3]] == [rf"$\chi$ = {value}" for value in (0.1, 0.2, 0.3)]
-    drawn = meshes(figure)[3].get_array()
-    np.testing.assert_allclose(drawn, np.tile(np.log10(0.99 - dataset.zeta.values), (11, 1)), rtol=1e-12)
+    assert figure.legends[0].get_title().get_text().endswith("stable\xa0throughout")
+    (mesh, *_), decay = meshes(figure), np.log10(0.99 - dataset.zeta.values)
+    np.testing.assert_allclose(mesh.get_array(), np.tile(decay, (11, 1)), rtol=1e-12)
+    assert (mesh.norm.vmin, mesh.norm.vmax) == pytest.approx((decay.min(), decay.max()))
 
 
 def test_nine_slices_without_a_boundary_show_growth():
