@@ -86,6 +86,8 @@ class Solver:
     short_loops: bool = False
     #: One point takes as long as a compilation.
     lengthy: bool = False
+    #: For jobs of one point only, which wait for the compiler.
+    single: bool = False
     #: So few points are asked for that the compiler would take longer to optimise than all of them to compute.
     few: bool = False
 

@@ -69,7 +69,8 @@ class Job:
                 state = "jax_enable_x64 = False: set by the context of this call"
                 raise InputError(f"{state}; expected jax.enable_x64(True)")
         _programs.enable(short=True)
-        return tuple(map(for_device, self.problem.solvers))
+        several = self.grid.size > 1
+        return tuple(for_device(solver) for solver in self.problem.solvers if not (solver.single and several))
 
     @property
     def scene(self) -> Scene:

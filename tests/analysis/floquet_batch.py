@@ -33,7 +33,8 @@ class FloquetBatch:
         self.compiled: dict[int, object] = {}
 
     def solvers(self, rtol: float) -> tuple[Solver, ...]:
-        return ANALYSIS.solvers(self.system, request(self.method, rtol, self.outputs, **self.options))
+        solvers = ANALYSIS.solvers(self.system, request(self.method, rtol, self.outputs, **self.options))
+        return tuple(solver for solver in solvers if not solver.single)
 
     def kernel(self, index: int):
         def batch(values, effort, rtol):

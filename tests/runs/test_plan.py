@@ -15,6 +15,7 @@ from drivetrain_jax.runs.job import Block, block_size, chunk_size, make_plan
 from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import load_scene
 from drivetrain_jax.store.parts import Shards
+from drivetrain_jax.systems import get_system
 
 pytestmark = pytest.mark.usefixtures("small_blocks")
 
@@ -39,6 +40,16 @@ def test_every_point_is_in_exactly_one_chunk_of_the_cheapest_solver(grid_scene):
             assert np.all(cheap == (name == "broadcasting"))
             efforts = 10 * columns["a"] if name == "broadcasting" else 100 * columns["b"]
             assert chunk.effort == np.ceil(efforts.max()) and np.all(np.diff(efforts) <= 0)
+
+
+def test_only_a_job_of_one_point_takes_the_program_of_one_point():
+    """One point of a chart, left by others that are reused or in the last block, takes the program of the chart."""
+    fixed = {"beta": 0.3, **get_system("cardan").presets["base"]}
+    for values in ([1.0], [1.0, 2.0]):
+        axes = {"Omega": {"values": values}}
+        e = engine({"system": "cardan", "analysis": "floquet", "axes": axes, "fixed": fixed})
+        ((chunk,),) = [e.plan(block) for block in e.blocks(np.array([0]))]
+        assert e.solvers[chunk.solver].name.endswith("one point") == (len(values) == 1)
 
 
 def test_plan_does_not_depend_on_how_effort_is_predicted(grid_scene, monkeypatch):

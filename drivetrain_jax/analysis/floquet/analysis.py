@@ -10,6 +10,7 @@ published over its full period (``form = "published"``), with other coordinates,
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -30,7 +31,6 @@ from drivetrain_jax.analysis.floquet.effort import (
     traced_panels,
 )
 from drivetrain_jax.analysis.floquet.results import VARIABLES, lacks, results
-from drivetrain_jax.analysis.numerics.kernels import count_of
 from drivetrain_jax.analysis.numerics.lanes import Constants, lane_count, over_lanes
 from drivetrain_jax.systems import System
 
@@ -108,13 +108,11 @@ def direct_solvers(
     )
 
     def single(columns: Mapping[str, Any]) -> np.ndarray:
-        if (count := count_of(columns)) > 1:
-            return np.full(count, np.inf)
         panels = effort(columns, False)
         return np.where(panels <= _MOST_SINGLE, panels, np.inf)
 
-    # One point alone waits for its program, not for its panels.
-    return (plain, strong, solver(", one point", form, single, small=True, cost=0.99)) if damped else (plain,)
+    alone = replace(solver(", one point", form, single, small=True, cost=0.99), single=True)
+    return (plain, strong, alone) if damped else (plain,)
 
 
 FORMS = ("reduced", "published")
