@@ -407,7 +407,8 @@ def _small_multiples(dataset: xr.Dataset, fields: Sequence[str]) -> Figure:
     """
     # Flags that are the same everywhere say less than how far from a boundary the points are.
     same = {key: codes for key in fields if flags(dataset[key]) and not np.ptp((codes := valid(dataset, key)).values)}
-    said = [f"{[*flags(codes), FAILED, PENDING][int(codes.values.flat[0])]} throughout" for codes in same.values()]
+    codes = [[*flags(every), FAILED, PENDING][int(every.values.flat[0])] for every in same.values()]
+    said = [f"{flag.replace('_', ' ')} throughout" for flag in codes]
     fields, said = ([key for key in fields if key not in same], said) if len(same) < len(fields) else (fields, [])
     names = sweep_axes(dataset)
     long = [name for name in names if dataset.sizes[name] > _FEW_MAPS]
