@@ -55,7 +55,6 @@ LINE = {
     "analysis": "line",
     "axes": {"b": {"values": [1.0, 4.0]}, "a": {"start": 0, "stop": 9, "num": 9}},
 }
-LINE_A = {"a": {"start": 0, "stop": 9, "num": 9}}
 ONE = {"system": "toy", "analysis": "toy", "outputs": ["value", "wave"], "fixed": {"a": 1.0}}
 FIXED_PATH = LINE | {"axes": {"a": {"values": [1.0, 2.0]}}, "fixed": {"b": 5.0}}
 POINTS = {"system": "toy", "analysis": "toy", "points": {"a": [1.0, 8.0, 9.5], "b": [1.0, 2.0, 3.0]}}
