@@ -614,7 +614,12 @@ def horner(coefficients: tuple[float, ...], x: Array) -> Array:
 @jax.custom_jvp
 def sincos(x: Any) -> tuple[Array, Array]:
     """``(sin x, cos x)`` of an angle in [rad], any shape; |x| up to 2^20, NaN for NaN and infinity."""
-    x = jnp.asarray(x, float)
+    return _sincos(jnp.asarray(x, float))
+
+
+# Compiled functions are traced once for all calls, which come by the hundred in the stages of a march.
+@jax.jit
+def _sincos(x: Array) -> tuple[Array, Array]:
     quarter = jnp.floor(x * _TWO_OVER_PI + 0.5)
     r = x - quarter * _HALF_PI[0] - quarter * _HALF_PI[1] - quarter * _HALF_PI[2]
     z = r * r

@@ -224,6 +224,8 @@ def by_groups(
     The outcome is ``NOT_FINITE`` without a start.
     """
     steps_asked = request.options["steps"]
+    # One trace for the shapes and the results.
+    march = jax.jit(march, static_argnums=0 if steps_asked else ())
     needed = jnp.full(batch_shape(flow), float(steps_asked)) if steps_asked else needed_steps(flow)
     started = starts(flow)
     able = started & is_short_enough(needed, request.options["max_time"] / jnp.asarray(flow.period), following, request)
