@@ -87,17 +87,44 @@ def strobe_map(flow: Flow, steps: Any) -> Callable[..., Frame]:
     return advance
 
 
+# Most lanes with the stages of a step in a loop, which compiles several times as fast; with more lanes it would be slower.
+_LOOPED = 16
+
+
 def _step(flow: Flow, angles: Callable[[float], tuple], h: Any, frame: Frame) -> Frame:
     """One step of DOP853 (Hairer, Norsett & Wanner, Solving ODEs I, 2nd ed. (1993), II.5) for all parts of the frame."""
     # Local import: it takes half a second, and only tracing needs it.
     from scipy.integrate import DOP853
 
+    if frame.state[0].size <= _LOOPED:
+        return _looped_step(flow, angles, h, frame, *map(jnp.asarray, (DOP853.A, DOP853.B, DOP853.C)))
     slopes: list[Frame] = []
     for stage, (c, b) in enumerate(zip(DOP853.C, DOP853.B, strict=True)):
         at = _advanced(frame._replace(contraction=None), h, DOP853.A[stage, :stage], slopes)
         contracts = frame.contraction is not None and b != 0
         slopes.append(_slopes(flow, contracts, angles(float(c)), at))
     return _advanced(frame, h, DOP853.B, slopes)
+
+
+def _looped_step(
+    flow: Flow, angles: Callable[[Any], tuple], h: Any, frame: Frame, rows: Array, weights: Array, nodes: Array
+) -> Frame:
+    """The step with the coefficients of a scheme, its stages in a loop."""
+    start, contracts = frame._replace(contraction=None), frame.contraction is not None
+
+    def moved(frame: Frame, weights: Array, slopes: Frame) -> Frame:
+        def along(x: Array, rates: Array) -> Array:
+            return x + h * sum(weights[j] * rate for j, rate in enumerate(rates))
+
+        return jax.tree.map(along, frame, slopes)
+
+    def stage(k: Array, slopes: Frame) -> Frame:
+        at = stored(moved)(start, rows[k], slopes._replace(contraction=None))
+        new = _slopes(flow, contracts, angles(nodes[k]), at)
+        return jax.tree.map(lambda x, y: jax.lax.dynamic_update_index_in_dim(x, y, k, 0), slopes, new)
+
+    blank = jax.tree.map(lambda x: jnp.zeros((len(nodes), *x.shape)), frame)
+    return stored(moved)(frame, weights, jax.lax.fori_loop(0, len(nodes), stage, blank))
 
 
 def _advanced(frame: Frame, h: Any, weights: Any, slopes: Sequence[Frame]) -> Frame:
