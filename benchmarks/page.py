@@ -117,7 +117,8 @@ def text_of(folder: Path, page: Path) -> str:
         "# Error against run time",
         "Speed of the package over that of its fastest rival, at equal error. "
         f"Speeds within {LEVEL - 1:.0%} are level. Regions are compared at an error of at most {GOAL:g}, on one core unless "
-        "the title names two.",
+        "the title names two. Atlases: `warm` is an atlas and its chart in a running process, without compilation; "
+        "`cold command` is `drivetrain run` of the same scene, with its start, compilation and file.",
         answer(pairs) if pairs else not_measured("precision_cardan"),
         "Written by `python -m benchmarks.page` from the files in `benchmarks/results/`, which have every setting of every "
         "method, and the versions of all packages; `drivetrain bench` measures them again.",
@@ -280,11 +281,22 @@ def _highlights(rows: pd.DataFrame, pairs: Sequence[Compared]) -> list[str]:
     rates = 1 / rows[rows.system == "atlas"].groupby("method").seconds_per_point.min()
     words = {"package, evaluation": "grid cells", "package, points": "scattered points"}
     speeds = [f"up to {number(rates[method])} {what} per second" for method, what in words.items() if method in rates]
-    charts = [f"{pair.region}: {against(pair.ratio, pair.rival.method)}" for pair in pairs if pair.system == "atlas"]
+    charts = [_chart_of_atlas(pair) for pair in pairs if pair.system == "atlas"]
     if speeds:
         lines.append(f"Evaluation of an atlas, with bounds and verdicts: {'; '.join(speeds)}.")
         lines.append(f"Atlas of the chart: {charts[0]}; {charts[-1]} (the start of heyoka is not counted).")
     return lines
+
+
+_WAYS = {
+    "warm": "in a running process, without compilation",
+    "cold command": "by `drivetrain run`, with its start and compilation",
+}
+
+
+def _chart_of_atlas(pair: Compared) -> str:
+    way, cells = pair.region.split(", ", 1)
+    return f"{cells} {_WAYS[way]}, {against(pair.ratio, pair.rival.method)}"
 
 
 def atlas_part(folder: Path) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections.abc import Iterator, KeysView
+from collections.abc import Iterable, Iterator, KeysView
 from dataclasses import dataclass
 from decimal import Decimal
 from numbers import Real
@@ -205,17 +205,25 @@ class Component:
 class Dimension:
     """A dimension that an analysis adds to its results: coordinate values and meaning.
 
-    Empty ``values`` stand for 1, 2, ... up to the length of the results.
+    Empty ``values`` stand for 1, 2, ... up to the length of the results; with ``components`` for ``theta 1``, ``theta 2``,
+    ..., ``theta_rate 1``, ...
     """
 
     name: str
     long_name: str
     values: tuple[int | float | str, ...]
     units: str = "1"
+    components: tuple[str, ...] = ()
 
     def labels(self, length: int) -> tuple[int | float | str, ...]:
         """The coordinate values of results of this ``length``."""
-        return self.values or tuple(range(1, length + 1))
+        if self.values or not self.components:
+            return self.values or tuple(range(1, length + 1))
+        return self.of_components(range(1, length // len(self.components) + 1))
+
+    def of_components(self, entries: Iterable[int | str]) -> tuple[str, ...]:
+        """The labels of the ``entries`` of every component."""
+        return tuple(f"{component} {entry}" for component in self.components for entry in entries)
 
 
 @dataclass(frozen=True)

@@ -395,6 +395,9 @@ def _result(job: Job) -> PointResult:
     if "verdict" in values and outcome.has_value:
         word = scene.analysis.variable("verdict").flags[int(values["verdict"])]
         sentence = f"{'; '.join(verdict_words(word, grows, scene.analysis.name == 'floquet'))}."
+    labels = {d.name: d.labels(sizes[d.name]) for d in scene.dimensions if d.name in sizes}
+    if scene.analysis.name == "forced" and outcome.has_value:
+        sentence = _forced_sentence(values, {v.name: v for v in shown}, labels)
     orders = order_crossings(scene, ordered, values) if outcome.has_value else None
     return PointResult(
         system=scene.system.name,
@@ -405,7 +408,7 @@ def _result(job: Job) -> PointResult:
         outcome=outcome,
         variables={v.name: v for v in buffer.variables},
         parameter_units={p.name: p.units for p in scene.system.parameters},
-        labels={d.name: d.labels(sizes[d.name]) for d in scene.dimensions if d.name in sizes},
+        labels=labels,
         physical=physical,
         remedy=scene.analysis.remedy(scene.request),
         advice=scene.analysis.advice(scene.request),
@@ -413,6 +416,23 @@ def _result(job: Job) -> PointResult:
         orders=orders,
         sentence=sentence or (orders.sentence(values, ordered.get("speed", 0.0)) if orders else ""),
     )
+
+
+def _forced_sentence(
+    values: Mapping[str, Any], variables: Mapping[str, Variable], labels: Mapping[str, Sequence[Any]]
+) -> str:
+    """The largest amplitude and torque of the linear model and of the nonlinear orbit; empty without any."""
+    sentences = []
+    for prefix, motion in (("", "The forced motion of the linear model"), ("orbit_", "The nonlinear orbit")):
+        reached = []
+        for name in (f"{prefix}amplitude", f"{prefix}torque"):
+            if name in values and np.isfinite(values[name]).all():
+                (dim,), units, k = variables[name].dims, variables[name].units, int(np.argmax(values[name]))
+                size = f"{np.degrees(values[name][k]):.4g} deg" if units == "rad" else f"{values[name][k]:.4g} {units}"
+                label = str(labels[dim][k])
+                reached.append(f"{size} ({f'{dim} {label}' if label[0].isdigit() else f'{label} {dim}'})")
+        sentences += [f"{motion} reaches {' and '.join(reached)}."] if reached else []
+    return " ".join(sentences)
 
 
 # Digits of given values in an answer.

@@ -115,8 +115,11 @@ class Scene(Problem):
     def dimensions(self) -> tuple[Dimension, ...]:
         """Dimensions of the results besides those of the sweep; those of the elements have the names of the parts."""
         labels = tuple(f"{i} {name}".rstrip() for i, name in enumerate(self.parts, 1))
-        named = labels and self.system.state_axis is not None
-        return tuple(replace(d, values=labels) if named and d.name in _OF_ELEMENTS else d for d in super().dimensions)
+        if not labels or self.system.state_axis is None:
+            return super().dimensions
+        known = {name: labels for name in _OF_ELEMENTS}
+        known |= {d.name: d.of_components(labels) for d in super().dimensions if d.components}
+        return tuple(replace(d, values=known.get(d.name, d.values)) for d in super().dimensions)
 
 
 def result_variables(problem: Problem) -> tuple[Variable, ...]:
