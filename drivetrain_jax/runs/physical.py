@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 import tomllib
 from collections.abc import Callable, Mapping
@@ -179,6 +180,8 @@ def _numbers(parameter: Parameter, value: Any, physical: bool) -> Any:
 
 # The column of a table with the names of its rows, and the entry of a scene that holds them.
 _NAMES, PARTS = "part", "parts"
+# Lines in front of a CSV table that begin with # and hold no separator.
+_COMMENT = re.compile(r"\A(?:#[^,;\t\n]*\n)+")
 _HEADER = re.compile(r"\s*(.+?)\s*(?:[\[(]\s*(.*?)\s*[\])])?\s*")
 
 
@@ -237,9 +240,11 @@ def _rows(path: Path) -> pd.DataFrame:
             parts = pd.DataFrame(tomllib.loads(path.read_text("utf-8"))[_NAMES]).rename(columns={"name": _NAMES})
             return pd.DataFrame([parts.columns, *parts.to_numpy()]).map(lambda x: x if pd.isna(x) else str(x))
         if kind == ".csv":
-            # Spreadsheets write a byte order mark, and semicolons where the comma is a decimal mark.
-            first = path.read_text("utf-8-sig").partition("\n")[0]
-            return pd.read_csv(path, sep=max(",;\t", key=first.count), encoding="utf-8-sig", **how)
+            # Spreadsheets write a byte order mark, and semicolons where the comma is a decimal mark. A line such as
+            # `# shaft.csv` in front is a comment.
+            text = _COMMENT.sub("", path.read_text("utf-8-sig"))
+            first = text.partition("\n")[0]
+            return pd.read_csv(io.StringIO(text), sep=max(",;\t", key=first.count), **how)
     except ImportError:
         raise InputError("data: .xlsx needs the package openpyxl; pip install 'drivetrain_jax[tables]'") from None
     # Readers raise exceptions of zip files, XML and their own for a damaged file.

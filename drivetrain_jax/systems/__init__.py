@@ -118,5 +118,7 @@ def get_system(name: str) -> type[System]:
         return getattr(import_module(f"drivetrain_jax.systems.{name}"), _BUILT_IN[name])
     system = load_plugin(SYSTEMS, name, "a system", lambda x: isinstance(x, type) and issubclass(x, System))
     if system is None:
-        raise InputError(f"system = {name!r}: unknown{nearest(str(name), system_names())}")
+        known = nearest(str(name), system_names())
+        how = "; register a class of your own: dt.register(CLASS) in Python, an entry point for commands"
+        raise InputError(f"system = {shown(name)}: unknown{known}{'' if 'did you mean' in known else how}")
     return system

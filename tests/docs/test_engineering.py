@@ -37,7 +37,7 @@ def commands(text: str) -> list[tuple[str, str]]:
 def test_every_command_gives_the_answer_of_the_page(tmp_path, monkeypatch, capsys):
     text = PAGE.read_text()
     for name, content in re.findall(r"^```\w+\n# (\w+\.\w+)\n(.*?)^```", text, re.M | re.S):
-        (tmp_path / name).write_text(content)
+        (tmp_path / name).write_text(f"# {name}\n{content}")
     monkeypatch.chdir(tmp_path)
     found = commands(text)
     assert len(found) >= 11

@@ -167,6 +167,8 @@ def test_wrong_input_is_one_clear_line(given, part):
 def test_unknown_system_and_analysis():
     with pytest.raises(dt.InputError, match="system = 'tractor'"):
         dt.point("tractor", "toy")
+    with pytest.raises(dt.InputError, match="system = 'mine': unknown; .*dt.register"):
+        dt.point("mine", "toy")
     with pytest.raises(dt.InputError, match="analysis = 'dance'"):
         dt.point("toy", "dance")
     with pytest.raises(dt.InputError, match="system = 5"):
