@@ -156,9 +156,7 @@ def radius_error(region: str, setting: Any, result: Any) -> Judged:
     return Judged(error, failed, notice or ("nan" if failed else ""))
 
 
-def floquet(
-    points: Mapping[str, Mapping[str, float]], method: str, name: str = "", count: int = MANY, **options: Any
-) -> Any:
+def floquet(points: Mapping[str, Mapping[str, float]], method: str, count: int = MANY, **options: Any) -> Any:
     """The package's analysis ``floquet`` as ``prepare`` of a method."""
 
     def prepare(region: str, rtol: float) -> Job:
