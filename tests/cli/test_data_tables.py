@@ -46,6 +46,13 @@ def test_a_shaft_from_a_table_has_its_critical_speeds(tmp_path, capsys, kind):
         assert stiff.parameters["k_A"] == 5e7 and stiff.parameters["k_D"] == 5e6
 
 
+def test_a_comment_in_front_of_a_table_is_left_out(tmp_path):
+    rows = [("# shaft.csv",), *ROWS]
+    assert read_table(written(tmp_path / "t.csv", rows=rows)) == read_table(written(tmp_path / "s.csv"))
+    # A first column of numbers may be called #.
+    assert read_table(written(tmp_path / "n.csv", rows=[("#", "k_A"), (1, 2.0)]))["k_A"] == 2.0
+
+
 def test_a_scene_overrides_its_table_and_the_command_line_both(tmp_path, capsys):
     scene = tmp_path / "shaft.toml"
     axis = '[axes]\nk_D = { values = [1e6, "5 MN/m"] }\n[fixed]\nk_A = 1e6\n'

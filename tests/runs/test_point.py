@@ -167,7 +167,7 @@ def test_wrong_input_is_one_clear_line(given, part):
 def test_unknown_system_and_analysis():
     with pytest.raises(dt.InputError, match="system = 'tractor'"):
         dt.point("tractor", "toy")
-    with pytest.raises(dt.InputError, match="system = 'mine': unknown; .*dt.register"):
+    with pytest.raises(dt.InputError, match=r"system = 'mine': unknown; .*dt\.register"):
         dt.point("mine", "toy")
     with pytest.raises(dt.InputError, match="analysis = 'dance'"):
         dt.point("toy", "dance")

@@ -393,11 +393,19 @@ def test_uneven_rotation_is_that_of_the_reference(case):
 
 
 def test_the_answer_on_forced_motion_names_the_largest_twist_and_torque():
-    lists = {"k": [9e3, 8e3], "c": [0.5, 0.5], "J": [0.03, 0.5], "beta": ["9 deg", "5 deg"], "parts": ["tube", "pinion"]}
+    lists = {
+        "k": [9e3, 8e3],
+        "c": [0.5, 0.5],
+        "J": [0.03, 0.5],
+        "beta": ["9 deg", "5 deg"],
+        "parts": ["tube", "pinion"],
+    }
     found = dt.point("driveline", "forced", speed="3000 rpm", **lists)
     assert found.labels["state"] == ("theta 1 tube", "theta 2 pinion", "theta_rate 1 tube", "theta_rate 2 pinion")
     shaft, twist = ("1 tube", "2 pinion")[int(np.argmax(found.amplitude))], np.degrees(max(found.amplitude))
-    assert found.sentence.startswith(f"The forced motion of the linear model reaches {twist:.4g} deg (shaft {shaft}) and ")
+    assert found.sentence.startswith(
+        f"The forced motion of the linear model reaches {twist:.4g} deg (shaft {shaft}) and "
+    )
     unnamed = dt.point("driveline", "forced", speed="3000 rpm", **{**lists, "parts": []})
     assert unnamed.labels["state"] == ("theta 1", "theta 2", "theta_rate 1", "theta_rate 2")
 

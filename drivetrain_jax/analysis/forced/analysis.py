@@ -539,9 +539,9 @@ def _displacements(system: type[System]) -> Dimension:
 
 
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
-    names, meaning = tuple(c.name for c in system.state), "component of the state"
-    state = Dimension("state", meaning, (), components=names) if system.state_axis else Dimension("state", meaning, names)
-    return state, _displacements(system)
+    names, state = tuple(c.name for c in system.state), Dimension("state", "component of the state", ())
+    several = {"components" if system.state_axis else "values": names}
+    return replace(state, **several), _displacements(system)
 
 
 def _of_system(system: type[System]) -> dict[str, Any]:
