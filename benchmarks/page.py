@@ -240,7 +240,7 @@ def _chart(folder: Path, rows: pd.DataFrame) -> str:
     text = (
         f"Spectral radius for beta from 0 to 1.5, Omega from 0.1 to 2; chart of 30,000 cells; {'; '.join(file.notes)}. "
         "Slow methods computed a part of the cells: a coarser grid (`diffrax`) or random ones (SciPy); their largest error "
-        "is over these. The chart of the front page begins at Omega = 0.01 and takes twice as long. Compilation is not "
+        "is over these. The chart of Fig. 3 begins at Omega = 0.01 and takes twice as long. Compilation is not "
         f"included. Bold: the fastest setting of each method with an error of at most {GOAL:g}."
     )
     return f"{text}\n\n{markdown(_CHART_HEAD, [_chart_row(row, '**' * (row.Index in best)) for row in chart.itertuples()])}"
