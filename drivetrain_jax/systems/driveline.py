@@ -1,6 +1,6 @@
 """Driveline: a chain of Hooke joints, gears, torsionally flexible shafts and inertias, driven at constant speed.
 
-Own derivation, docs/theory/driveline.md, whose equation numbers are used here. Element i = 0..N-1, counted from the driven
+Own derivation, docs/theory/driveline.md, whose equation numbers are used here. Element i = 0..N-1, counted from the driving
 end: a joint (angle beta_i, phase_i of its yokes), then the ratio r_i, then the shaft k_i, c_i, then the inertia J_i at its
 end; the last end is free. Time is the rotation tau = speed t of the driving end; the prime is d/dtau. theta_i is the twist
 of shaft i, a_i = Psi_i + x_i the absolute rotation of J_i, and Psi_i that of the rigid chain. All functions broadcast over
