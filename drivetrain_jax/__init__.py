@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from drivetrain_jax.systems.rattle import Rattle
     from drivetrain_jax.systems.tripod import Tripod
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 # Modules of the names; all others are in `analyses`.
 _HOME = {
