@@ -200,7 +200,8 @@ BUILT_IN: dict[str, Resonances | None] = {
 # Orders of an excitation: multiples of the speed of a shaft, and the speeds at which they meet natural frequencies.
 
 # Natural frequencies below this part of the largest one, or below these Hz, belong to rigid motions, which no order meets.
-_RIGID, _SLOWEST = 1e-6, 1e-6
+# Rounding leaves rigid motions 1e-14 of the largest frequency.
+RIGID_PART, _SLOWEST = 1e-12, 1e-6
 # Results that are natural frequencies, and Hz for one of their units.
 FREQUENCIES = ("natural_frequency", "critical_speed", "angular_frequency")
 _IN_HERTZ = {"Hz": 1.0, "rpm": 1 / 60, "rad/s": 1 / (2 * np.pi)}
@@ -233,7 +234,7 @@ class Orders:
         """
         frequency = np.asarray(frequency, float)
         largest = np.max(frequency, initial=0.0, where=frequency < np.inf)
-        elastic = np.isfinite(frequency) & (frequency > max(_RIGID * largest, _SLOWEST))
+        elastic = np.isfinite(frequency) & (frequency > max(RIGID_PART * largest, _SLOWEST))
         return np.where(elastic, frequency, np.nan)[..., None] * 60 / np.array(list(self.per_turn.values()))
 
     def within(self, speeds: np.ndarray, low: float, high: float, unit: str = "rpm") -> list[str]:

@@ -21,7 +21,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from drivetrain_jax._errors import InputError
-from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range, stored_orders
+from drivetrain_jax.resonances import FREQUENCIES, RIGID_PART, Orders, in_hertz, operating_range, stored_orders
 from drivetrain_jax.view import charts
 from drivetrain_jax.view.sheet import Sheet, fit_axis, is_logarithmic, plain_decades, write_names
 from drivetrain_jax.view.style import (
@@ -42,8 +42,6 @@ from drivetrain_jax.view.style import (
 _RIGID, _FAMILIES, _COUPLED = "#9a9a9a", ("#16324f", "#d1771e", "#3f8f5f", "#7a4fa0", "#999933"), "#a0308c"
 # Gears in a row; most mode shapes of gears and of shafts; most maps, and contours in them.
 _COLUMNS, _GEARS, _SHAFTS, _MAPS, _CONTOURS = 4, 16, 6, 4, 8
-# Ratio to the largest frequency below which a frequency is zero, which a logarithmic axis cannot show.
-_NEGLIGIBLE = 1e-6
 # Relative difference below which frequencies are one multiple frequency, with one shape drawn.
 _SAME = 1e-8
 # Relative distances at which neighbours are close, and at which they are two frequencies.
@@ -137,7 +135,7 @@ def _types_over(dataset: xr.Dataset, name: str) -> Figure:
     close = _close(frequency)
     sheet = Sheet(1 + bool(close), height=4.4 / (1 + bool(close)), sharey=False)
     axes = sheet.axes[0, 0]
-    moving = np.where(frequency > _NEGLIGIBLE * np.nanmax(frequency), frequency, np.nan)
+    moving = np.where(frequency > RIGID_PART * np.nanmax(frequency), frequency, np.nan)
     order = np.argsort(dataset["branch"].values if "branch" in dataset else frequency, axis=1, kind="stable")
     branches, kinds = (np.take_along_axis(array, order, axis=1) for array in (moving, types))
     _draw_coloured(axes, x, branches, np.vectorize(colours.get)(kinds))
@@ -314,7 +312,7 @@ def _modes_over(dataset: xr.Dataset, name: str, shown: str) -> Figure:
     x, y = dataset[name].values, dataset[shown].transpose("mode", name)
     logarithmic = is_logarithmic(x)
     charts.require_values(y, positive=logarithmic)
-    speeds = y.where(y > _NEGLIGIBLE * y.max()) if logarithmic else y
+    speeds = y.where(y > RIGID_PART * y.max()) if logarithmic else y
     colours, drawn = _colours(len(y)), speeds.values
     sheet = charts.stack(dataset.assign({shown: speeds}), name, [[shown]], colours=colours, named=False)
     axes = sheet.axes[0, 0]

@@ -10,6 +10,7 @@ import pytest
 import drivetrain_jax as dt
 from drivetrain_jax.cli import main
 from drivetrain_jax.report.statements import statements
+from drivetrain_jax.resonances import Orders
 
 ANGLES = ["0 deg", "72 deg", "144 deg", "219 deg", "288 deg"]
 GEAR = {"planet_angle": ANGLES, "teeth": [20, 26, 72]}
@@ -40,6 +41,12 @@ def test_five_planets_meet_the_mesh_at_590_593_and_892_rpm():
     assert "  2     590.472" in repr(found) and "speed of the carrier at which an order meets the mode" in repr(found)
     stored = json.loads(found.to_json())["crossings"]
     assert stored["values"]["mesh order 1"][:2] == [None, pytest.approx(first[1])] and stored["units"] == "rpm"
+
+
+def test_orders_meet_elastic_modes_beside_a_rigid_ring():
+    """Frequencies of five planets with k_ru = 1e20 N/m, which stands for a ring that cannot turn."""
+    speeds = Orders("carrier", {"mesh order 1": 72.0}).speeds([2e-7, 708.5, 9.2e8])
+    np.testing.assert_allclose(speeds[:, 0], [np.nan, 708.5 * 60 / 72, 9.2e8 * 60 / 72])
 
 
 @pytest.mark.full
