@@ -361,6 +361,8 @@ def radius_gradient(system: type[System], values: Mapping[str, float]) -> dict[s
 EVEN, _HALVINGS = 91, range(8, 22)
 # Points and rounds by which peaks and crossings of the limit are refined.
 _PARTS, _PEAK_ROUNDS, _LIMIT_ROUNDS, _VERDICT_ROUNDS = 9, 2, 3, 5
+# Most rounds for a sharp peak, which a neighbour falls short of by more than this part.
+_SHARP_ROUNDS, _SHARP = 12, 1e-3
 # Part of the middle of an unstable range up to which a predicted resonance belongs to it.
 _NEAR = 0.01
 
@@ -434,9 +436,11 @@ def _sampled(
     likely = likely[(likely > low) & (likely < high)]
     x = np.unique(np.concatenate([np.linspace(low, high, EVEN), low + steps, high - steps, likely]))
     y = function(x)
-    for _ in range(_PEAK_ROUNDS):
+    for number in range(_SHARP_ROUNDS):
         size = np.max(y, axis=1)
         peaks = np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] >= size[2:])) + 1
+        if number >= _PEAK_ROUNDS:
+            peaks = peaks[size[peaks] - np.minimum(size[peaks - 1], size[peaks + 1]) > _SHARP * size[peaks]]
         x, y = _refined(function, x, y, [(x[k - 1], x[k + 1]) for k in peaks])
     for _ in range(rounds):
         inside = np.max(y, axis=1) <= limit

@@ -40,6 +40,13 @@ def test_ranges_within_a_limit_follow_the_resonance_curve():
     assert "above the limit of 2 deg; within the limit from 0.5 to " in found.text(lambda r: f"{r:.6g}")
 
 
+@pytest.mark.parametrize("damping", [1e-3, 1e-5, 1e-7])
+def test_the_largest_amplitude_is_that_of_a_sharp_peak(damping):
+    """The curve has its peak 1/(2 D sqrt(1 - D^2)) up to a million times narrower than the distance of the samples."""
+    found = TWO.along(lambda r: 1 / np.hypot(1 - r**2, 2 * damping * r)[:, None], 0.5, 1.5003, np.array([1.0001]))
+    assert found.largest * 2 * damping == pytest.approx(1.0, rel=1e-3)
+
+
 def test_a_curve_below_the_limit_is_within_it():
     found = TWO.along(lambda r: np.full((r.size, 2), 0.01), 1.0, 2.0, np.empty(0))
     assert found.within == ((1.0, 2.0),) and "within the limit of 2 deg" in found.text(str)
