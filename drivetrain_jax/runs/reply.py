@@ -338,10 +338,12 @@ def limit_line(asked: AtlasQuery, parameter: str, limit: Crossing | None, before
     if limit is None or not sensitivities:
         return "", []
     physical = asked.shaft.quantity(parameter, limit.value) if asked.shaft else None
-    name, _, units = physical or (parameter, 0.0, asked.atlas.scene.system.parameter(parameter).units)
+    name, _, stored = physical or (parameter, 0.0, asked.atlas.scene.system.parameter(parameter).units)
+    units = asked.show(parameter, limit.value)[-1] if asked.show else stored
+    size = 1.0 if units == stored else _units.factor(stored, units)
     least = _ROUNDING * abs(sensitivities[0].percent)
     changes = ", ".join(
-        f"{effect.name} {effect.percent:+.3g}" for effect in sensitivities if abs(effect.percent) > least
+        f"{effect.name} {size * effect.percent:+.3g}" for effect in sensitivities if abs(effect.percent) > least
     )
     unit = "" if units == "1" else f" [{units}]"
     return f"{before}+1 % of a value changes {name} by{unit}: {changes}", [

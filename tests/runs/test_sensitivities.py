@@ -49,6 +49,17 @@ def test_limits_move_as_those_of_changed_shafts(atlas):
 
 
 @pytest.mark.full
+def test_limits_move_in_the_unit_of_their_answer(atlas):
+    hertz = np.sqrt(DATA["k1"] / DATA["J1"]) / (2 * np.pi)
+    found = atlas_answers.speed_windows(
+        atlas, {}, show=lambda name, x: ("speed", x * hertz, "Hz") if name == "Omega" else (name, x, "1")
+    )
+    first = found.data["windows"][0]["sensitivities"][1][0]
+    said = f"+1 % of a value changes speed by [Hz]: {first['name']} {first['percent'] / 60:+.3g}, "
+    assert first["name"] == "k2" and said in str(found)
+
+
+@pytest.mark.full
 def test_sensitivities_of_the_radius_are_sorted_and_physical(atlas):
     found = atlas_answers.query(atlas, {"speed": 3130.0})
     effects = {each["name"]: each for each in found.data["sensitivities"]}
