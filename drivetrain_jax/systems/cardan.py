@@ -92,16 +92,11 @@ def panels_needed(xp: Any, phase: Any, sharpness: Any, decay: Any, digits: float
 
 
 def _alpha(c2: Any, c1: Any) -> Any:
-    xp, c2, c1 = numeric(c2, c1)
+    xp, numbers, c1 = numeric(c2, c1)
     # Without damping of the driving shaft the ratio has no meaning. A traced value cannot be checked.
-    if xp is np and np.any((c1 == 0) & (c2 != 0)):
-        raise InputError(f"c2 = {c2.tolist()!r}: expected 0 if c1 = 0 (alpha = c2/c1)")
-    return xp.divide(c2, xp.where(c1 == 0, 1.0, c1))
-
-
-def _radians(angle: Any) -> Any:
-    xp, angle = numeric(angle)
-    return xp.radians(angle)
+    if xp is np and np.any((c1 == 0) & (numbers != 0)):
+        raise InputError(f"c2 = {numbers.tolist()!r}: expected 0 if c1 = 0 (alpha = c2/c1)")
+    return c2 / xp.where(c1 == 0, 1.0, c1)
 
 
 def _frequency(j1: Any, k1: Any) -> Any:
@@ -139,7 +134,7 @@ PHYSICAL = PhysicalData(
         *stiffness_of_tubes("stiffness", replaceable=True),
         Conversion("k1", ("stiffness",), partial(_entry, 0), "stiffness[0]", replaceable=True, whole=("stiffness",)),
         Conversion("k2", ("stiffness",), partial(_entry, 1), "stiffness[1]", replaceable=True, whole=("stiffness",)),
-        Conversion("beta", ("angle",), _radians, "angle", lambda beta: beta * (180 / np.pi)),
+        Conversion("beta", ("angle",), lambda angle: angle * (np.pi / 180), "angle", lambda beta: beta * (180 / np.pi)),
         Conversion(
             "Omega",
             ("speed", "J1", "k1"),

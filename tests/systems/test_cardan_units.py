@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.integrate import solve_ivp
 
 from drivetrain_jax import InputError
@@ -25,6 +26,13 @@ def test_values():
     assert found == pytest.approx(
         {"beta": math.radians(35), "Omega": 50 * math.pi / 200, "zeta": 3 / 200, "alpha": 0.5, "mu": 0.25, "gamma": 6.0}
     )
+
+
+def test_labelled_arrays_keep_their_dimensions():
+    """Otherwise an atlas would answer pairs of angles and speeds on the outer product of both."""
+    arrays = {name: xr.DataArray([1.0, 2.0], dims="run") for name in ("speed", "angle", "c2")}
+    found = PHYSICAL.converted(DATA | arrays)
+    assert {found[name].dims for name in ("Omega", "beta", "alpha")} == {("run",)}
 
 
 def test_multipliers_are_those_of_the_equations_in_seconds():
