@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 
 from drivetrain_jax._errors import shown
+from drivetrain_jax._quantities import FIRST_FAILURE
 
 # Relative tolerance for the rounding of a formula evaluated in another order.
 ROUNDING = 1e-9
@@ -84,6 +85,11 @@ def multiple(name: str, factor: float, of: str) -> Rule:
 def _differ(one: xr.DataArray, other: xr.DataArray) -> xr.DataArray:
     infinite = (np.isinf(one) != np.isinf(other)) & one.notnull() & other.notnull()
     return infinite | (abs(one - other) > ROUNDING * (abs(one) + abs(other)))
+
+
+def _events_differ(ds: xr.Dataset) -> xr.DataArray:
+    listed = ds["event_time"].notnull().sum("event")
+    return (listed != np.minimum(ds["event_count"], ds.sizes["event"])) & (ds["outcome"] < FIRST_FAILURE)
 
 
 @dataclass(frozen=True)
@@ -243,7 +249,12 @@ BUILT_IN = {
         logarithmic=("amplitude", "orbit_amplitude", "torque", "orbit_torque", "condition"),
         predicted="forced",
     ),
-    "history": Declared(figure="motions.history"),
+    "history": Declared(
+        (Rule("event_time has event_count values, up to its length", ("event_time", "event_count"), _events_differ),),
+        # NaN is allowed: lists of events are longer than most motions need.
+        gaps=("event_time", "event_velocity"),
+        figure="motions.history",
+    ),
     "parameters": Declared(),
     "phasing": Declared(),
     "harmonic_response": Declared(figure="responses.harmonic_response"),

@@ -116,6 +116,11 @@ def test_the_first_wrong_point_is_named(chart):
         ),
         ("forced", {"condition": real([0.5])}, "1 <= condition"),
         (
+            "history",
+            {"event_time": real([[0.5, np.nan]], "event"), "event_count": real([2.0])},
+            "event_time has event_count values, up to its length",
+        ),
+        (
             "frequency_response",
             {"branch_amplitude": real([[[0.1, 0.3], [0.2, 0.1]]], "branch", "shaft")},
             "largest branch_amplitude rises along branch",
@@ -143,6 +148,10 @@ def test_rules_of_the_analyses(analysis, variables, rule):
     [
         ("basins", 2, {"basin_fraction": real([[np.nan]], "attractor"), "unsettled_fraction": real([1.0])}),
         ("forced", 2, {"condition": real([1e17])}),
+        *(
+            ("history", 0, {"event_time": real([times], "event"), "event_count": real([count])})
+            for times, count in (([0.5, np.nan], 1.0), ([0.5, 0.7], 3.0))
+        ),
         (
             "lyapunov",
             0,
