@@ -98,11 +98,8 @@ def _section(path: Path, number: int, asked: list[str], amplitude: Any) -> dict[
         chart, compared = dataset.load(), False
         if analysis == "floquet" and charts.sweep_axes(chart) == [charts.role(chart, "speed")]:
             from drivetrain_jax.runs.reply import with_unstable_ranges
-            from drivetrain_jax.systems import get_system
 
-            # Other systems have atlases for that.
-            atlas = "atlas" in get_system(str(attrs.get("system"))).models
-            chart = chart if atlas or "verdict" not in chart else with_unstable_ranges(chart)[0]
+            chart = with_unstable_ranges(chart)[0] if "verdict" in chart else chart
     if amplitude is not None and (analysis == "floquet" or amplitudes(chart)):
         from drivetrain_jax.runs.reply import Limit
         from drivetrain_jax.systems import get_system
