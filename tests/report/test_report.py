@@ -154,7 +154,11 @@ def test_units_are_those_asked_for_or_those_of_the_scene(truck, tmp_path):
     assert main(["report", *map(str, truck), "--out", str(out), "--units", "Hz,mrad"]) == 0
     text = " ".join(Page(out.read_text()).words)
     amplitude = dt.open_result(truck[1]).amplitude.values[1]
-    assert "Unstable at speed = 23.75 to 23.8185 (S11) Hz." in text and "speed [Hz]" in text and "rpm" not in text.split("Scene")[0]
+    assert (
+        "Unstable at speed = 23.75 to 23.8185 (S11) Hz." in text
+        and "speed [Hz]" in text
+        and "rpm" not in text.split("Scene")[0]
+    )
     assert f"to {1e3 * amplitude[1]:.6g} mrad at speed = 26 Hz" in text and " angle joint angle 209.44 mrad" in _plain(
         text
     )
