@@ -176,7 +176,7 @@ def _in_frame(block: Block, vectors: Array) -> Array:
 def clusters(frequency: Array, tolerance: Array) -> Array:
     """Flags of modes i and j in the same cluster, (n, n, ...): neighbours at most ``tolerance`` (n - 1, ...) apart."""
     apart = (frequency[1:] - frequency[:-1] > tolerance).astype(jnp.int32)
-    number = jnp.concatenate([jnp.zeros_like(apart[:1]), jnp.cumsum(apart, axis=0)])
+    number = jnp.concatenate([jnp.zeros_like(frequency[:1], jnp.int32), jnp.cumsum(apart, axis=0)])
     return number[:, None] == number[None]
 
 

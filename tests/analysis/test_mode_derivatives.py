@@ -134,3 +134,10 @@ def test_a_rigid_mode_stays_but_for_a_spring_that_would_hold_it(jacobian):
         slopes = np.stack(jax.tree.leaves(jacobian[name]))
         assert np.isfinite(slopes[:, 1:]).all()
         assert np.isnan(slopes[:, 0]).all() if name in ("k_su", "k_cu") else (slopes[:, 0] == 0).all(), name
+
+
+def test_one_mass_on_one_spring():
+    chain = dt.Driveline(speed=100.0, k=[1e4], c=[1.0], J=[0.1])
+    f, slope = jax.value_and_grad(lambda s: dt.modes(s, outputs="natural_frequency").natural_frequency[0])(chain)
+    assert slope.k[0] == pytest.approx(f / 2e4) and slope.J[0] == pytest.approx(-f / 0.2)
+    assert dt.modes(chain, outputs="multiplicity").multiplicity.tolist() == [1]
