@@ -446,6 +446,7 @@ def test_gaps_in_the_result_of_an_analysis_stay():
 
     found = swept(undamped)
     assert found.spectral_radius.values.tolist() == [0.0, 0.5] and found.outcome.values.tolist() == [0, 0]
+    assert not [finding for finding in check(found) if finding.broken]
 
 
 @pytest.mark.full
