@@ -292,7 +292,9 @@ def _of_data(
 
 def gradient_lines(sensitivities: Sequence[Sensitivity] | None, output: str = "spectral_radius") -> list[str]:
     """The sensitivities of a number as text."""
-    if not sensitivities or not np.isfinite([effect.slope for effect in sensitivities]).any():
+    slopes = np.array([effect.slope for effect in sensitivities or ()])
+    # What has no effect has the slope 0, also where the others have none.
+    if not np.isfinite(slopes[slopes != 0]).any() and not (slopes.size and np.isfinite(slopes).all()):
         why = "two multipliers have the largest modulus, within the errors, or it cannot be computed"
         why = why if output == "spectral_radius" else "it has no derivative at this point"
         return [f"gradient of {output}", f"  none: {why}"]

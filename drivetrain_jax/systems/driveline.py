@@ -295,6 +295,10 @@ def best_phases(beta: Components, phase: Components, ratio: Components) -> list[
     return phases
 
 
+# Part of the uneven rotation of all joints that remains, by rounding, where they cancel.
+_CANCELS = 1e-14
+
+
 def uneven_rotation(beta: Components, phase: Components, ratio: Components, half_turns: Any) -> tuple[Any, Any]:
     """Range of the speed of the rigid output over its mean, and of its lead [rad], peak to peak.
 
@@ -305,7 +309,10 @@ def uneven_rotation(beta: Components, phase: Components, ratio: Components, half
         b: Any = jnp.zeros((), complex)
         for angle, p in zip(beta, phase, strict=True):
             b = _moved(b, jnp.tan(angle / 2) ** 2, p)
-        rho = jnp.abs(b)
+        total = sum(jnp.tan(angle / 2) ** 2 for angle in beta)
+        # Where joints cancel, the range has a corner: NaN is its derivative by everything that moves them.
+        corner = (jnp.abs(b) <= _CANCELS * total) & (total > 0)
+        rho = jnp.where(corner, jnp.sqrt(jnp.where(corner, 0.0 * (total + sum(phase)), 1.0)), jnp.abs(b))
         return 4 * rho / (1 - rho**2), 2 * jnp.arcsin(rho) * abs(math.prod(ratio[last:]))
     mean = math.prod(ratio)
 

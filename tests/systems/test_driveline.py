@@ -423,6 +423,20 @@ def test_best_phases_close_the_polygon_of_the_joints(lengths):
     assert least == pytest.approx(2 * math.sinh(max(0.0, 2 * max(lengths) - sum(lengths))), abs=1e-12)
 
 
+def test_joints_that_cancel_have_no_derivative():
+    """The range of the speed has a corner there: one-sided differences by a phase are +-0.0805."""
+    line = {"speed": 100.0, "k": [1e4] * 2, "c": [1.0] * 2, "J": [0.1] * 2, "beta": [0.2, 0.2]}
+
+    def slopes(**change):
+        chain = dt.Driveline(**line | change)
+        return jax.grad(lambda s: dt.phasing(s, outputs=["speed_variation"]).speed_variation)(chain)
+
+    crossed = slopes(phase=[0.0, np.pi / 2])
+    assert np.isnan([*crossed.beta, *crossed.phase]).all() and crossed.k == (0, 0)
+    assert slopes(beta=[0.0, 0.0]).beta == (0, 0)
+    np.testing.assert_allclose(slopes(phase=[0.0, np.pi / 2 + 1e-3]).phase, [-0.0805, 0.0805], rtol=2e-3)
+
+
 def test_the_answer_on_phasing_agrees_with_published_rules():
     """Elbe: U = .0027 at 2.9765 deg; 5 and 4 deg make 3.000 deg by the makers' rule, 3.0024 exactly; 30 + 30 deg."""
     assert rotation(["2.9765 deg"], [0.0]).speed_variation == pytest.approx(0.0027, abs=2e-8)
