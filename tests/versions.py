@@ -31,6 +31,7 @@ NEEDED = [*PROJECT["dependencies"], *(each for extra in EXTRAS for each in PROJE
 PYTHONS = [each.rpartition(" ")[2] for each in PROJECT["classifiers"] if re.search(r":: 3\.\d", each)]
 RESOLUTIONS = {"lowest": "lowest-direct", "newest": "highest"}
 FEW = ("--set", "axes.beta.num=3", "--set", "axes.Omega.num=4", "--quiet")
+MOTION = ("element=input", "excitation_frequency=3000", "beta=0.157", "zeta=0.0037", "chi_n=0.01")
 MORE = (*FEW[:3], "axes.Omega.num=5", "--quiet")
 ATLAS = """
 system = "cardan"
@@ -68,6 +69,7 @@ WORK = (
     (("report", "q.nc", "--out", "q.html"), ""),
     (("point", "cardan", "floquet", *POINT), "spectral_radius"),
     (("point", "cardan", "floquet", "--data", "data.xlsx", *POINT[1:]), "spectral_radius"),
+    (("point", "tripod", "lyapunov", *MOTION), "Periodic."),
     (("run", "atlas.toml", "--out", "a.nc", "--quiet"), ""),
     (("query", "a.nc", "beta=0.3", "--json"), "spectral_radius"),
     (("explore", "a.nc", "--out", "a.html"), ""),
