@@ -292,19 +292,20 @@ def _of_data(
 
 def gradient_lines(sensitivities: Sequence[Sensitivity] | None, output: str = "spectral_radius") -> list[str]:
     """The sensitivities of a number as text."""
-    slopes = np.array([effect.slope for effect in sensitivities or ()])
+    effects = sensitivities or ()
+    slopes = np.array([effect.slope for effect in effects])
     # What has no effect has the slope 0, also where the others have none.
-    if not np.isfinite(slopes[slopes != 0]).any() and not (slopes.size and np.isfinite(slopes).all()):
+    if not np.isfinite(slopes[slopes != 0]).any() and not (effects and np.isfinite(slopes).all()):
         why = "two multipliers have the largest modulus, within the errors, or it cannot be computed"
         why = why if output == "spectral_radius" else "it has no derivative at this point"
         return [f"gradient of {output}", f"  none: {why}"]
-    least = _ROUNDING * max(abs(np.nan_to_num(effect.percent)) for effect in sensitivities)
+    least = _ROUNDING * max(abs(np.nan_to_num(effect.percent)) for effect in effects)
     return [
         f"gradient of {output}, largest effect of 1 % first",
         *(
             f"  {effect.name:<24} {effect.percent:+.6g} for +1 %, {effect.slope:.6g}"
             f"{'' if effect.units == '1' else f' per {effect.units}'}"
-            for effect in sensitivities
+            for effect in effects
             if not abs(effect.percent) <= least
         ),
     ]
