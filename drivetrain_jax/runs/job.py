@@ -69,8 +69,10 @@ class Job:
                 state = "jax_enable_x64 = False: set by the context of this call"
                 raise InputError(f"{state}; expected jax.enable_x64(True)")
         _programs.enable(short=True)
-        several = self.grid.size > 1
-        return tuple(for_device(solver) for solver in self.problem.solvers if not (solver.single and several))
+        # An atlas has no grid.
+        return tuple(
+            for_device(solver) for solver in self.problem.solvers if not (solver.single and self.grid.size > 1)
+        )
 
     @property
     def scene(self) -> Scene:

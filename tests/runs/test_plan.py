@@ -52,6 +52,13 @@ def test_only_a_job_of_one_point_takes_the_program_of_one_point():
         assert e.solvers[chunk.solver].name.endswith("one point") == (len(values) == 1)
 
 
+def test_an_atlas_of_multipliers_has_no_grid_but_solvers():
+    axes, fixed = {"Omega": {"start": 1.0, "stop": 1.1}}, {"beta": 0.3, **get_system("cardan").presets["base"]}
+    scene = {"system": "cardan", "analysis": "atlas", "axes": axes, "fixed": fixed, "outputs": ["floquet_multiplier"]}
+    (solver,) = engine(scene).solvers
+    assert not solver.single
+
+
 def test_plan_does_not_depend_on_how_effort_is_predicted(grid_scene, monkeypatch):
     whole = engine(grid_scene).plan(Block(0))
     monkeypatch.setattr(job, "_PIECE", 7)
