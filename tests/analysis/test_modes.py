@@ -125,7 +125,6 @@ def test_shapes_solve_the_equations_of_motion(shapes):
 
 
 SIX = tuple(2 * math.pi * i / 6 for i in range(6))
-ONE_ANGLE = TABLE_2 | {"planet_angle": (0.3,) * 4, "I_p": (0.61, 0.61, 0.6100001, 0.61)}
 FULL = ["natural_frequency", "natural_frequency_error", "mode_shape", "mode_type"]
 
 
@@ -168,13 +167,6 @@ def test_planets_that_differ_slightly_have_modes_of_their_own(name):
         assert_modes(gear, *(ds[key].values[i] for key in FULL[:3]))
     # With a spread of 1e-5 the share outside the family is below the square of the spread.
     assert [(ds.mode_type.values[1:] == kind).sum(1).tolist() for kind in (PLANET, RIGID)] == [[9, 9], [1, 1]]
-
-
-@pytest.mark.full
-def test_unequal_planets_at_one_angle():
-    given = {name: list(value) for name, value in ONE_ANGLE.items() if isinstance(value, tuple)}
-    found = dt.point("planetary", "modes", outputs=FULL, **given).values
-    assert_modes(ONE_ANGLE, *(found[key] for key in FULL[:3]))
 
 
 @pytest.mark.full
