@@ -57,8 +57,8 @@ COUNTS = {
     # Operations in the trace of one chunk, nested ones once; results that nobody requests would add to them. 600 of those of
     # cardan are the loop of diffrax.
     "operations cardan": 8226,
-    # 200 of those of bicardan are segments without mass: which shafts are undefined, and the number of modes.
-    "operations bicardan": 1059,
+    # 500 of those of bicardan eliminate what supports hold: which frequencies are undefined, and the number of modes.
+    "operations bicardan": 1397,
     "operations rattle": 4891,
     # Steps that the plan predicts for the 1,550 cells of the chart, padding included.
     "predicted panels cardan": 59_904,
