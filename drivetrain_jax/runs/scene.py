@@ -114,12 +114,11 @@ class Scene(Problem):
     @cached_property
     def dimensions(self) -> tuple[Dimension, ...]:
         """Dimensions of the results besides those of the sweep; those of the elements have the names of the parts."""
-        labels = tuple(f"{i} {name}".rstrip() for i, name in enumerate(self.parts, 1))
+        labels, own = tuple(f"{i} {name}".rstrip() for i, name in enumerate(self.parts, 1)), super().dimensions
         if not labels or self.system.state_axis is None:
-            return super().dimensions
-        known = {name: labels for name in _OF_ELEMENTS}
-        known |= {d.name: d.of_components(labels) for d in super().dimensions if d.components}
-        return tuple(replace(d, values=known.get(d.name, d.values)) for d in super().dimensions)
+            return own
+        known = dict.fromkeys(_OF_ELEMENTS, labels) | {d.name: d.of_components(labels) for d in own if d.components}
+        return tuple(replace(d, values=known.get(d.name, d.values)) for d in own)
 
 
 def result_variables(problem: Problem) -> tuple[Variable, ...]:

@@ -310,7 +310,7 @@ def uneven_rotation(beta: Components, phase: Components, ratio: Components, half
         for angle, p in zip(beta, phase, strict=True):
             b = _moved(b, jnp.tan(angle / 2) ** 2, p)
         total = sum(jnp.tan(angle / 2) ** 2 for angle in beta)
-        # Where joints cancel, the range has a corner: NaN is its derivative by everything that moves them.
+        # Where joints cancel, the range has a corner. The root of 0 has no derivative by what would move them.
         corner = (jnp.abs(b) <= _CANCELS * total) & (total > 0)
         rho = jnp.where(corner, jnp.sqrt(jnp.where(corner, 0.0 * (total + sum(phase)), 1.0)), jnp.abs(b))
         return 4 * rho / (1 - rho**2), 2 * jnp.arcsin(rho) * abs(math.prod(ratio[last:]))

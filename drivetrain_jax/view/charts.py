@@ -186,6 +186,11 @@ def flags(variable: xr.DataArray) -> list[str]:
     return str(variable.attrs.get("flag_meanings", "")).split()
 
 
+def flag_words(variable: xr.DataArray) -> list[str]:
+    """The meanings of the codes of a variable of :func:`valid`, as words."""
+    return [flag.replace("_", " ") for flag in (*flags(variable), FAILED, PENDING)]
+
+
 def flag_scale(variable: xr.DataArray, strength: float = 1.0) -> dict[str, Any]:
     """The colours of a variable of :func:`valid` with flags; a ``strength`` below 1 mixes them with white."""
     names = variable.attrs.get("flag_colours") or [FLAG_COLOURS.get(flag, FRAME_GREY) for flag in flags(variable)]
@@ -197,10 +202,10 @@ def flag_scale(variable: xr.DataArray, strength: float = 1.0) -> dict[str, Any]:
 def flag_entries(variable: xr.DataArray, strength: float = 1.0) -> list[Patch]:
     """Legend entries of the flags that occur in a variable of :func:`valid`; with their numbers of points, unless these are
     many."""
-    names, entries = [*flags(variable), FAILED, PENDING], []
+    names, entries = flag_words(variable), []
     counts = np.bincount(variable.values.astype(int).ravel(), minlength=len(names))
     for name, colour, count in zip(names, flag_scale(variable, strength)["cmap"].colors, counts, strict=True):
-        label = name.replace("_", " ") + f" ({count})" * (variable.size <= _COUNTED or name in _ALARMING)
+        label = name + f" ({count})" * (variable.size <= _COUNTED or name in _ALARMING)
         if count and name != _COMPUTED:
             entries.append(Patch(facecolor=colour, edgecolor=FRAME_GREY, linewidth=0.6, label=label))
     return entries
@@ -406,10 +411,11 @@ def _small_multiples(dataset: xr.Dataset, fields: Sequence[str]) -> Figure:
     that varies.
     """
     # Flags that are the same everywhere say less than how far from a boundary the points are.
-    same = {key: codes for key in fields if flags(dataset[key]) and not np.ptp((codes := valid(dataset, key)).values)}
-    codes = [[*flags(every), FAILED, PENDING][int(every.values.flat[0])] for every in same.values()]
-    said = [f"{flag.replace('_', ' ')} throughout" for flag in codes]
-    fields, said = ([key for key in fields if key not in same], said) if len(same) < len(fields) else (fields, [])
+    same = [key for key in fields if flags(dataset[key]) and not np.ptp(valid(dataset, key).values)]
+    same = same if len(same) < len(fields) else []
+    fields = [key for key in fields if key not in same]
+    codes = [valid(dataset, key) for key in same]
+    notes = [f"{flag_words(code)[int(code.values.flat[0])]} at every point" for code in codes]
     names = sweep_axes(dataset)
     long = [name for name in names if dataset.sizes[name] > _FEW_MAPS]
     horizontal = horizontal_first(dataset, long if len(long) > 1 else names)[0]
@@ -432,7 +438,7 @@ def _small_multiples(dataset: xr.Dataset, fields: Sequence[str]) -> Figure:
     height = 1.8 if len(parts) > 1 else min(2.5, max(_LOWEST, _PAGE / len(rows)))
     sheet = maps(rows, (horizontal, vertical), height=height, titled=titled)
     drawn = len(across) * len(down)
-    return sheet.finish(dataset, ", ".join(said + [f"{drawn} of {total} charts shown"] * (drawn < total)))
+    return sheet.finish(dataset, ", ".join(notes + [f"{drawn} of {total} charts shown"] * (drawn < total)))
 
 
 def _slices(dataset: xr.Dataset, name: str) -> list[dict[str, int]]:
@@ -596,13 +602,13 @@ def stack(dataset: xr.Dataset, along: str, panels: Sequence[Sequence[str]], **lo
 def _sentence(codes: xr.DataArray, axis: xr.DataArray, exact: str) -> str:
     """The values of ``axis`` at which flags of :func:`valid` other than the most frequent one occur; ``exact`` says the
     unstable ranges, if they are known."""
-    names = [flag.replace("_", " ") for flag in (*flags(codes), FAILED, PENDING)]
+    names = flag_words(codes)
     counts = np.bincount(codes.values.astype(int), minlength=len(names))
     most = int(counts.argmax())
     words = [exact] if exact else []
     shown = [k for k, n in enumerate(names) if counts[k] and k != most and not (words and n in ("stable", "unstable"))]
     words += [f"{names[k]} at {ranges_text(axis, codes.values == k)}" for k in shown]
-    text = "; ".join(words) or (f"{names[most]} throughout" if counts[most] == codes.size else "")
+    text = "; ".join(words) or (f"{names[most]} at every point" if counts[most] == codes.size else "")
     # The sentence begins at the axes, not at the edge of the figure.
     return textwrap.fill(f"{text[:1].upper()}{text[1:]}." if text else "", LETTERS - 15)
 

@@ -55,7 +55,7 @@ def test_a_figure_over_one_axis_begins_with_its_ranges():
     inside = speeds[results.unstable(0.5, speeds)]
     assert above(10) == f"Unstable at Omega = {inside[0]:.6g} to {inside[-1]:.6g}."
     assert above(0) == "Undecided at Omega = 0.5 to 0.525."
-    assert above(2) == "Stable throughout." and above(1) == "Failed at Omega = 0.5."
+    assert above(2) == "Stable at every point." and above(1) == "Failed at Omega = 0.5."
     # An atlas knows its ranges, which may be narrower than a cell.
     narrow = xr.Variable(("unstable_range", "end"), [[0.7001, 0.7002]])
     figure = plot(results.chart().isel(beta=2).assign_coords(unstable_Omega=narrow))
@@ -159,7 +159,7 @@ def test_a_range_without_a_boundary_shows_how_far_it_is_from_one():
     dataset["spectral_radius"] = dataset.spectral_radius - dataset.zeta
     figure = plot(dataset)
     assert [axes.get_title() for axes in panels(figure)[:3]] == [rf"$\chi$ = {value}" for value in (0.1, 0.2, 0.3)]
-    assert figure.legends[0].get_title().get_text().endswith("stable\xa0throughout")
+    assert figure.legends[0].get_title().get_text().endswith("stable\xa0at\xa0every\xa0point")
     (mesh, *_), decay = meshes(figure), np.log10(0.99 - dataset.zeta.values)
     np.testing.assert_allclose(mesh.get_array(), np.tile(decay, (11, 1)), rtol=1e-12)
     assert (mesh.norm.vmin, mesh.norm.vmax) == pytest.approx((decay.min(), decay.max()))

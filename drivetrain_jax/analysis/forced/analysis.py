@@ -539,9 +539,9 @@ def _displacements(system: type[System]) -> Dimension:
 
 
 def _dimensions(system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
-    names, state = tuple(c.name for c in system.state), Dimension("state", "component of the state", ())
-    several = {"components" if system.state_axis else "values": names}
-    return replace(state, **several), _displacements(system)
+    names, several = tuple(c.name for c in system.state), bool(system.state_axis)
+    values, components = ((), names) if several else (names, ())
+    return Dimension("state", "component of the state", values, components=components), _displacements(system)
 
 
 def _of_system(system: type[System]) -> dict[str, Any]:
