@@ -1,11 +1,11 @@
 """Forced response: periodic solution of the linearised system, and the nonlinear periodic orbit with its multipliers.
 
 Linear: the variational equations over one period T from rest give ``y(T; y0) = r + Z y0``, hence ``y0 = (I - Z)^-1 r``.
-Nonlinear: continuation along growing forcing (:func:`~drivetrain_jax.analysis.forced.orbit.shoot`), and along the speed
-of the system, if it has one, from below and from above (:mod:`~drivetrain_jax.analysis.forced.orbit`), unless the
-first orbit is nearly the linear response. Of several orbits the result is the stable one of the smallest amplitude, or the
-smallest one if none is stable; ``orbit_count`` is their number. Orbits on branches that these paths do not meet are not
-found.
+Nonlinear: continuation along growing forcing (:func:`~drivetrain_jax.analysis.forced.orbit.along_forcing`), and along
+the speed of the system, if it has one, from below and from above (:func:`~drivetrain_jax.analysis.forced.orbit.neighbours`),
+unless the first orbit is nearly the linear response. Of several orbits the result is the stable one of the smallest
+amplitude, or the smallest one if none is stable; ``orbit_count`` is their number. Orbits on branches that these paths do
+not meet are not found.
 
 Outcome: ``TOLERANCE_NOT_MET`` if the estimated error of a state exceeds ``rtol`` times its largest entry; ``NOT_CONVERGED``
 if I - Z is singular to working accuracy or no nonlinear orbit was found. Only missing results are NaN: without an orbit, a
@@ -33,6 +33,7 @@ from drivetrain_jax.analysis.forced.orbit import (
     Field,
     Orbit,
     Transition,
+    along_forcing,
     controller,
     corrected,
     in_units_of,
@@ -40,7 +41,6 @@ from drivetrain_jax.analysis.forced.orbit import (
     neighbours,
     newton_step,
     periodic_slopes,
-    shoot,
     size_of,
     transition,
 )
@@ -332,27 +332,20 @@ def nonlinear_orbit(
     """
     usable = response.outcome < Outcome.NOT_CONVERGED
     start = jnp.where(usable, response.state, 0.0)
-    # Nonlinearity matters for states of order one; a smaller response is measured in units of its own size.
-    unit, sharp = jnp.minimum(size_of(start), 1.0), _sharpness(rtol, TRANSITION_SHARPNESS)
-    first = shoot(in_units_of(unit, model.field), model.period, start.size, sharp)
-    first = first._replace(
-        state=unit * first.state, error=unit * first.error, outcome=jnp.where(usable, first.outcome, response.outcome)
-    )
-    bend = jnp.max(jnp.abs(first.state - start)) / size_of(start)
-    others = search(usable & ~((first.outcome == Outcome.SUCCESS) & (bend <= LEAST_BEND)))
-    known = jnp.where(first.outcome == Outcome.SUCCESS, first.state, jnp.nan)
-    others = jnp.where(distinct(jnp.concatenate([known[None], others]), NEAR)[1:, None], others, jnp.nan)
+    unit = _unit(start)
+    first = unit * along_forcing(in_units_of(unit, model.field), model.period, start.size)
+    bend = jnp.max(jnp.abs(first - start)) / size_of(start)
+    guesses = jnp.concatenate([first[None], search(usable & ~(bend <= LEAST_BEND))])
+    guesses = jnp.where(usable & distinct(guesses, NEAR)[:, None], guesses, jnp.nan)
     # One after another, because points have few: in a batch, a missing orbit would cost as much as one.
-    others = jax.lax.map(partial(_corrected, model, rtol), others)
-    every = jax.tree.map(lambda x, more: jnp.concatenate([jnp.asarray(x)[None], more]), first, others)
-    every = jax.lax.map(partial(_finished, model, rtol, rows), every)
+    every = jax.lax.map(partial(_near, model, rtol, rows), guesses)
     exists = every.orbit.outcome < Outcome.NOT_CONVERGED
     unstable = every.radius > 1 + STABLE_MARGIN
     amplitude = every.largest[:, : len(model.displacements)]
     best = jnp.lexsort((jnp.max(amplitude, axis=1), unstable, ~exists))[0]
-    return jax.tree.map(lambda x: x[jnp.where(jnp.any(exists), best, 0)], every)._replace(
-        count=jnp.sum(distinct(every.orbit.state, SAME))
-    )
+    found = jax.tree.map(lambda x: x[jnp.where(jnp.any(exists), best, 0)], every)
+    orbit = found.orbit._replace(outcome=jnp.where(usable, found.orbit.outcome, response.outcome))
+    return found._replace(orbit=orbit, count=jnp.sum(distinct(every.orbit.state, SAME)))
 
 
 def distinct(states: Array, near: float) -> Array:
@@ -367,15 +360,22 @@ def distinct(states: Array, near: float) -> Array:
 def orbits_near(model: ForcedModel, guesses: Array, rtol: float) -> Found:
     """The orbits to which Newton's method leads from ``guesses`` (m, n), as results of m orbits; NaN where there is none."""
     rows = model.peaks(guesses.shape[1], torques=False)
-    return jax.vmap(lambda guess: _finished(model, rtol, rows, _corrected(model, rtol, guess)))(guesses)
+    return jax.vmap(partial(_near, model, rtol, rows))(guesses)
 
 
-def _corrected(model: ForcedModel, rtol: float, guess: Array) -> Orbit:
-    return corrected(model.field, guess, model.period, _sharpness(rtol, TRANSITION_SHARPNESS))
+def _unit(state: Array) -> Array:
+    """The unit of states near ``state``: nonlinearity matters for states of order one, smaller ones have their own size."""
+    return jax.lax.stop_gradient(jnp.minimum(size_of(state), 1.0))
 
 
-def _finished(model: ForcedModel, rtol: float, rows: Array, orbit: Orbit) -> Found:
-    """``orbit`` corrected by its closing error, with the largest ``|row . y|`` and its spectral radius."""
+def _near(model: ForcedModel, rtol: float, rows: Array, guess: Array) -> Found:
+    """The orbit to which Newton's method leads from ``guess``, corrected by its closing error, with the largest
+    ``|row . y|`` and its spectral radius."""
+    unit = _unit(guess)
+    orbit = corrected(
+        in_units_of(unit, model.field), guess / unit, model.period, _sharpness(rtol, TRANSITION_SHARPNESS)
+    )
+    orbit = orbit._replace(state=unit * orbit.state, error=unit * orbit.error)
     exists = orbit.outcome < Outcome.NOT_CONVERGED
     state = jnp.where(exists, orbit.state, 0.0)
     size = size_of(state)

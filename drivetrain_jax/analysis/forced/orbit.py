@@ -257,12 +257,12 @@ def _guesses(lanes_map: PeriodMap, x: Array, scale: Array, at: Array, count: int
     return jnp.where(exists[:, None], guess, jnp.nan)[:, :-1]
 
 
-def shoot(field: Field, period: float, n: int, rtol: float) -> Orbit:
-    """Periodic orbit of ``y' = field(t, y)`` on the path from rest along growing forcing; failures only set the ``Outcome``.
+def along_forcing(field: Field, period: float, n: int) -> Array:
+    """Approximate orbit of ``y' = field(t, y)`` on the path from rest along growing forcing, ``(n,)``; NaN if there is none.
 
     The orbits of ``y' = field(t, y) - (1 - lambda) field(t, 0)`` form a path (y, lambda) that starts at (0, 0). The
-    continuation runs through folds until lambda = 1; Newton's method corrects the orbit there. An orbit that is not on this
-    path is not found. States should be of order one.
+    continuation runs through folds until lambda = 1. An orbit that is not on this path is not found. States should be of
+    order one.
     """
 
     def forced(s: Any, x: Array) -> Array:
@@ -272,7 +272,7 @@ def shoot(field: Field, period: float, n: int, rtol: float) -> Orbit:
     rest, unit = jnp.zeros((n + 1, 1)), jnp.ones((n + 1, 1))
     guess = _guesses(period_map(forced, _RTOL, _MOST), rest, unit, jnp.ones(()), 1, **search)
     # Newton's method gives the derivatives of the orbit.
-    return corrected(field, jax.lax.stop_gradient(guess[0, :, 0]), period, rtol)
+    return jax.lax.stop_gradient(guess[0, :, 0])
 
 
 def speed_map(model_at: Callable[[Any], ForcedModel], rtol: float, most: int) -> PeriodMap:

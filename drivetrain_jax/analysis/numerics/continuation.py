@@ -18,8 +18,8 @@ from jax import Array
 
 from drivetrain_jax.analysis.numerics.linear_algebra import determinant, solve
 
-# Newton: most corrections.
-_CORRECTIONS = 8
+# Newton: most corrections, and size of the last one.
+_CORRECTIONS, _EXACT = 8, 1e-12
 # Factors on the step length after a failure and after few corrections, and the number of corrections that counts as few.
 _SHORTER, _LONGER, _FEW = 0.4, 1.4, 4
 _SHORTEST, _CLOSED, _LEAST_COSINE = 1e-7, 1e-9, 0.8
@@ -61,7 +61,8 @@ class Branch(NamedTuple):
 
 
 class _Solved(NamedTuple):
-    """An orbit: ``x``, its transition matrix, the unit tangent of the branch, and the work of Newton's method."""
+    """An iterate of Newton's method: ``x``, the transition matrix and the unit tangent of the branch at the iterate before,
+    the number of ``corrections``, the size of the last one, and the steps of all motions."""
 
     x: Array
     matrix: Array
@@ -71,44 +72,48 @@ class _Solved(NamedTuple):
     steps: Array
 
 
-def _on_plane(period_map: PeriodMap, guess: Array, normal: Array, scale: Array, converged: float) -> _Solved:
-    """The orbit on the plane through ``guess`` with the given ``normal`` (in units of ``scale``), by Newton's method."""
-    n, lanes = guess.shape[0] - 1, guess.shape[1]
-
-    def going(state: tuple[Array, _Solved]) -> Array:
-        count, solved = state
-        return (count < _CORRECTIONS) & jnp.any(solved.change > converged)
-
-    def correct(state: tuple[Array, _Solved]) -> tuple[Array, _Solved]:
-        count, old = state
-        open_ = old.change > converged
-        # Lanes that have converged do not move.
-        image = period_map(jnp.where(open_, old.x, jnp.nan))
-        ahead = jnp.sum(normal * (guess - old.x) / scale, axis=0)
-        right = jnp.concatenate([(old.x[:-1] - image.end) / scale[:-1], ahead[None]])
-        # Derivatives of F(y; p) - y in units of the scale, with the normal as last row.
-        inner = image.matrix - jnp.eye(n)[:, :, None]
-        rows = jnp.concatenate([inner, image.slope[:, None]], axis=1) * scale / scale[:-1, None]
-        system = jnp.concatenate([rows, jnp.broadcast_to(normal, scale.shape)[None]])
-        step, along = jnp.moveaxis(solve(system, jnp.stack([right, last], axis=1)), 1, 0)
-        tangent = along / jnp.sqrt(jnp.sum(along**2, axis=0))
-        change = jnp.max(jnp.abs(step), axis=0)
-        new = _Solved(old.x + step * scale, image.matrix, tangent, old.corrections + 1, change, old.steps + image.steps)
-        return count + 1, jax.tree.map(lambda a, b: jnp.where(open_, a, b), new, old)
-
+def _guessed(x: Array) -> _Solved:
+    """The guess ``x`` before any correction."""
+    n, lanes = x.shape[0] - 1, x.shape[1]
     zero = jnp.zeros(lanes)
+    return _Solved(x, jnp.zeros((n, n, lanes)), jnp.zeros_like(x), jnp.zeros(lanes, jnp.int32), zero + jnp.inf, zero)
+
+
+def _corrected(period_map: PeriodMap, old: _Solved, guess: Array, normal: Array, scale: Array, open_: Array) -> _Solved:
+    """``old`` after a Newton step towards the orbit on the plane through ``guess`` with the given ``normal`` (in units of
+    ``scale``); lanes that are not ``open_`` do not move."""
+    n = guess.shape[0] - 1
+    image = period_map(jnp.where(open_, old.x, jnp.nan))
+    ahead = jnp.sum(normal * (guess - old.x) / scale, axis=0)
+    right = jnp.concatenate([(old.x[:-1] - image.end) / scale[:-1], ahead[None]])
+    # Derivatives of F(y; p) - y in units of the scale, with the normal as last row.
+    inner = image.matrix - jnp.eye(n)[:, :, None]
+    rows = jnp.concatenate([inner, image.slope[:, None]], axis=1) * scale / scale[:-1, None]
+    system = jnp.concatenate([rows, jnp.broadcast_to(normal, scale.shape)[None]])
     last = jnp.zeros_like(guess).at[-1].set(1.0)
-    first = _Solved(guess, jnp.zeros((n, n, lanes)), last, jnp.zeros(lanes, jnp.int32), zero + jnp.inf, zero)
-    return jax.lax.while_loop(going, correct, (jnp.asarray(0), first))[1]
+    step, along = jnp.moveaxis(solve(system, jnp.stack([right, last], axis=1)), 1, 0)
+    tangent = along / jnp.sqrt(jnp.sum(along**2, axis=0))
+    change = jnp.max(jnp.abs(step), axis=0)
+    new = _Solved(old.x + step * scale, image.matrix, tangent, old.corrections + 1, change, old.steps + image.steps)
+    return jax.tree.map(lambda a, b: jnp.where(open_, a, b), new, old)
+
+
+def _unsolved(solved: _Solved, converged: float) -> Array:
+    """Flags of lanes that need another correction, and have one left."""
+    return (solved.change > converged) & (solved.corrections < _CORRECTIONS)
 
 
 class _Front(NamedTuple):
-    """The last orbit, the length of the next step, the number of the orbit on the branch, the last change of both test
-    values, ``(2, N)``, and the steps of all motions."""
+    """The last orbit; the ``guess`` of the next one and what Newton's method has made of it, ``trial``; the length of the
+    step between them, the ``number`` of orbits on the branch, that of ``attempts``, the last change of both test values,
+    ``(2, N)``, and the steps of all motions."""
 
     solved: _Solved
+    guess: Array
+    trial: _Solved
     length: Array
     number: Array
+    attempts: Array
     change: Array
     spent: Array
 
@@ -122,7 +127,7 @@ def follow(
     attempts: int,
     longest: float = 0.05,
     limits: tuple[Array | float, Array | float] = (0.0, np.inf),
-    converged: float = 1e-12,
+    converged: float = _EXACT,
     special: bool = True,
 ) -> Branch:
     """The branch of orbits through ``x = (y, p)``, shape ``(n + 1, N)``.
@@ -134,44 +139,37 @@ def follow(
     points.
     """
     closed = max(converged, _CLOSED)
-    rise = jnp.zeros_like(x).at[-1].set(direction)
-    first = _on_plane(period_map, x, rise, scale, converged)
-    first = first._replace(x=jnp.where(first.change <= closed, first.x.at[-1].set(x[-1]), jnp.nan))
     lanes = jnp.arange(x.shape[1])
 
     def row(solved: _Solved) -> Array:
         """The stored values of a point of the branch; the matrix of many states would take much memory."""
         return jnp.concatenate([solved.x, solved.matrix.reshape(-1, lanes.size)]) if special else solved.x
 
-    store = jnp.full((attempts, *row(first).shape), jnp.nan).at[0].set(row(first))
+    def going(front: _Front) -> Array:
+        """Flags of branches that have not ended; the others do not move."""
+        inside = (front.solved.x[-1] >= limits[0]) & (front.solved.x[-1] <= limits[1])
+        left = (front.attempts < attempts) & (front.spent <= _BUDGET)
+        return (inside | (front.number == 0)) & left & (front.length > _SHORTEST)
 
-    def step(state: tuple[Array, _Front, Array]) -> tuple[Array, _Front, Array]:
-        count, front, store = state
-        guess = jnp.where(_going(front, limits), front.solved.x + front.length * front.solved.tangent * scale, jnp.nan)
-        there = _on_plane(period_map, guess, front.solved.tangent, scale, converged)
-        aside = jnp.sqrt(jnp.sum(((there.x - guess) / scale) ** 2, axis=0))
-        good = (aside <= _ASIDE * front.length) & (there.change <= closed) & (there.x[-1] > 0)
-        good &= jnp.sum(there.tangent * front.solved.tangent, axis=0) > _LEAST_COSINE
-        good &= (front.length <= _FINE * longest) | _straight(front, there) | (not special)
-        front = _moved(front, there, good, longest, limits)
-        return count + 1, front, store.at[front.number, :, lanes].set(row(front.solved).T)
+    def correct(state: tuple[_Front, Array]) -> tuple[_Front, Array]:
+        # Every lane is at a correction of its own: none waits for the slowest to converge.
+        front, store = state
+        open_ = going(front)
+        trial = _corrected(period_map, front.trial, front.guess, front.solved.tangent, scale, open_)
+        ended = open_ & ~_unsolved(trial, converged)
+        front = _advanced(front._replace(trial=trial), ended, scale, longest, closed, special)
+        return front, store.at[front.number, :, lanes].set(row(front.solved).T)
 
-    def unfinished(state: tuple[Array, _Front, Array]) -> Array:
-        return (state[0] < attempts) & jnp.any(_going(state[1], limits))
-
-    begin = _Front(
-        first, jnp.full(lanes.shape, longest), jnp.zeros_like(lanes), jnp.zeros((2, lanes.size)), first.steps
-    )
-    *_, store = jax.lax.while_loop(unfinished, step, (jnp.asarray(1), begin, store))
+    rise = jnp.zeros_like(x).at[-1].set(direction)
+    none, unit = jnp.zeros(lanes.size, jnp.int32), jnp.ones(lanes.size)
+    start = _guessed(x)._replace(tangent=rise)
+    begin = _Front(start, x, start, longest * unit, none, none, jnp.zeros((2, lanes.size)), 0 * unit)
+    # The first row is that of lanes without an orbit yet.
+    store = jnp.full((1 + attempts, *row(start).shape), jnp.nan)
+    store = jax.lax.while_loop(lambda state: jnp.any(going(state[0])), correct, (begin, store))[1][1:]
     n = x.shape[0] - 1
     matrix = jnp.moveaxis(store[:, n + 1 :], 1, 0)
     return Branch(store[:, : n + 1], matrix.reshape(n, n, *matrix.shape[1:]) if special else None)
-
-
-def _going(front: _Front, limits: tuple[Array | float, Array | float]) -> Array:
-    """Flags of branches that have not ended; the others do not move."""
-    p = front.solved.x[-1]
-    return (p >= limits[0]) & (p <= limits[1]) & (front.length > _SHORTEST) & (front.spent <= _BUDGET)
 
 
 def _tests(matrix: Array) -> Array:
@@ -180,30 +178,46 @@ def _tests(matrix: Array) -> Array:
     return jnp.stack([determinant(eye - matrix), determinant(eye + matrix)])
 
 
-def _straight(front: _Front, there: _Solved) -> Array:
-    """True if both tests change so steadily that no pair of folds or doublings hides between the last two points."""
-    old, new = _tests(front.solved.matrix), _tests(there.matrix)
+def _straight(front: _Front) -> Array:
+    """True if both tests change so steadily that no pair of folds or doublings hides between orbit and trial."""
+    old, new = _tests(front.solved.matrix), _tests(front.trial.matrix)
     bent = jnp.abs(new - old - front.change * front.length)
     least = jnp.maximum(jnp.minimum(jnp.abs(old), jnp.abs(new)), _LEAST_DISTANCE)
     return jnp.all(bent <= _BENT * least, axis=0)
 
 
-def _moved(
-    front: _Front, there: _Solved, good: Array, longest: float, limits: tuple[Array | float, Array | float]
-) -> _Front:
-    """The front at ``there`` where it is ``good``, or else the old one with a shorter step.
+def _advanced(front: _Front, ended: Array, scale: Array, longest: float, closed: float, special: bool) -> _Front:
+    """The front at its trial where Newton's method has ``ended`` well, or else at the old orbit with a shorter step, and the
+    guess of the next orbit. A branch without a first orbit has ended.
 
     A point that is not near the tangent may lie on another part of the branch, or on another branch.
     """
+    there, first = front.trial, front.number == 0
+    aside = jnp.sqrt(jnp.sum(((there.x - front.guess) / scale) ** 2, axis=0))
+    near = (aside <= _ASIDE * front.length) & (there.x[-1] > 0)
+    near &= jnp.sum(there.tangent * front.solved.tangent, axis=0) > _LEAST_COSINE
+    if special:
+        near &= (front.length <= _FINE * longest) | _straight(front)
+    moved = ended & (there.change <= closed) & (near | first)
+    # The parameter of the first orbit is known.
+    there = there._replace(x=there.x.at[-1].set(jnp.where(first, front.guess[-1], there.x[-1])))
     longer = jnp.minimum(jnp.where(there.corrections <= _FEW, _LONGER, 1.0) * front.length, longest)
-    moved = good & _going(front, limits)
-    change = (_tests(there.matrix) - _tests(front.solved.matrix)) / front.length
+    shorter = jnp.where(first, 0.0, _SHORTER * front.length)
+    solved = jax.tree.map(lambda new, old: jnp.where(moved, new, old), there, front.solved)
+    length = jnp.where(ended, jnp.where(moved, longer, shorter), front.length)
+    change = (
+        jnp.where(first, 0.0, (_tests(there.matrix) - _tests(front.solved.matrix)) / front.length) if special else 0.0
+    )
+    guess = jnp.where(ended, solved.x + length * solved.tangent * scale, front.guess)
     return _Front(
-        jax.tree.map(lambda new, old: jnp.where(moved, new, old), there, front.solved),
-        jnp.where(good, longer, _SHORTER * front.length),
+        solved,
+        guess,
+        jax.tree.map(lambda new, old: jnp.where(ended, new, old), _guessed(guess), front.trial),
+        length,
         front.number + moved,
+        front.attempts + ended,
         jnp.where(moved, change, front.change),
-        front.spent + there.steps,
+        front.spent + jnp.where(ended, front.trial.steps, 0.0),
     )
 
 
@@ -223,14 +237,17 @@ def locate(period_map: PeriodMap, ends: tuple[Array, Array], tests: tuple[Array,
     def narrow(state: tuple[Array, ...]) -> tuple[Array, ...]:
         count, a, fa, b, fb, _, _ = state
         part = jnp.where(fb == fa, (a + b) / 2, b - fb * (b - a) / jnp.where(fb == fa, 1.0, fb - fa))
-        solved = _on_plane(period_map, ends[0] + part * chord, normal, scale, 1e-12)
+        guess = ends[0] + part * chord
+        solved = jax.lax.while_loop(
+            lambda solved: jnp.any(_unsolved(solved, _EXACT)),
+            lambda solved: _corrected(period_map, solved, guess, normal, scale, _unsolved(solved, _EXACT)),
+            _guessed(guess),
+        )
         f = jnp.where(doubling, *_tests(solved.matrix)[::-1])
         opposite = f * fb < 0
         settled = jnp.abs(part - b) <= _LOCATED
         bracket = (jnp.where(opposite, b, a), jnp.where(opposite, fb, fa / 2), part, f)
-        between = (solved.change <= _CLOSED) & (
-            jnp.sum(((solved.x - ends[0] - part * chord) / scale) ** 2, axis=0) <= span
-        )
+        between = (solved.change <= _CLOSED) & (jnp.sum(((solved.x - guess) / scale) ** 2, axis=0) <= span)
         return count + 1, *bracket, jnp.where(between, solved.x, jnp.nan), settled
 
     def unfinished(state: tuple[Array, ...]) -> Array:
