@@ -230,8 +230,8 @@ def check(fixed: Values) -> None:
 # The uneven rotation of the rigid chain, and phases that remove it.
 
 
-# Samples of a period from which extremes are refined, and hyperbolic length below which joints cancel.
-_SAMPLES, _CANCELLED = 4096, 1e-9
+# Samples of a period, those of their extremes that are refined, and hyperbolic length below which joints cancel.
+_SAMPLES, _EXTREMES, _CANCELLED = 4096, 16, 1e-9
 
 
 def _range(function: Callable[[Any], Any], period: Any) -> Any:
@@ -239,16 +239,21 @@ def _range(function: Callable[[Any], Any], period: Any) -> Any:
     step = jnp.asarray(period, float) / _SAMPLES
     times = step * jnp.arange(_SAMPLES).reshape(-1, *(1,) * step.ndim)
     slope = lambda t: jax.jvp(function, (t,), (jnp.ones_like(t),))[1]  # noqa: E731
-    values, ends = function(times), []
-    for place in (jnp.argmax(values, axis=0), jnp.argmin(values, axis=0)):
-        start = step * place
-        t = start
+    values = function(times)
+
+    def largest(sign: float) -> Array:
+        # The sample next to a lower peak may lie above that next to the highest one.
+        heights = sign * values
+        lower = (heights < jnp.roll(heights, 1, axis=0)) | (heights < jnp.roll(heights, -1, axis=0))
+        tops, places = jax.lax.top_k(jnp.moveaxis(jnp.where(lower, -jnp.inf, heights), 0, -1), _EXTREMES)
+        t = start = step * jnp.moveaxis(places, -1, 0)
         for _ in range(4):
             first, second = jax.jvp(slope, (t,), (jnp.ones_like(t),))
             moved = t - first / jnp.where(second == 0, jnp.inf, second)
             t = jnp.clip(moved, start - step, start + step)
-        ends.append(function(t))
-    return jnp.maximum(ends[0] - ends[1], 0.0)
+        return jnp.max(jnp.where(jnp.moveaxis(tops, -1, 0) == -jnp.inf, -jnp.inf, sign * function(t)), axis=0)
+
+    return jnp.maximum(largest(1.0) + largest(-1.0), 0.0)
 
 
 def _moved(b: Any, rho: Any, phase: Any) -> Any:
@@ -320,14 +325,14 @@ def uneven_rotation(beta: Components, phase: Components, ratio: Components, half
         angle = tau
         for b, p, r in zip(beta, phase, ratio, strict=True):
             angle = r * behind(b, p, angle)
-        return angle - mean * tau
+        return angle / mean - tau
 
     def speed(tau: Any) -> Any:
-        return jax.jvp(lead, (tau,), (jnp.ones_like(tau),))[1] / mean
+        return jax.jvp(lead, (tau,), (jnp.ones_like(tau),))[1]
 
     shape = jnp.broadcast_shapes(*map(jnp.shape, (*beta, *phase, *ratio)))
     period = jnp.broadcast_to(math.pi * jnp.asarray(half_turns), shape)
-    return _range(speed, period), _range(lead, period)
+    return _range(speed, period), _range(lead, period) * abs(mean)
 
 
 PHASING = (
