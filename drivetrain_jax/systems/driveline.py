@@ -232,9 +232,11 @@ def check(fixed: Values) -> None:
 
 # Samples of a period, those of their extremes that are refined, and hyperbolic length below which joints cancel.
 _SAMPLES, _EXTREMES, _CANCELLED = 4096, 16, 1e-9
+# Distances within rounding of extremes, and of their derivatives.
+_LEVEL, _ALIKE = 1e-12, 1e-9
 
 
-def _range(function: Callable[[Any], Any], period: Any) -> Any:
+def range_of(function: Callable[[Any], Any], period: Any) -> Any:
     """Largest minus smallest value of a smooth function of that ``period``, ``(...)``, by samples and Newton's method."""
     step = jnp.asarray(period, float) / _SAMPLES
     times = step * jnp.arange(_SAMPLES).reshape(-1, *(1,) * step.ndim)
@@ -251,9 +253,25 @@ def _range(function: Callable[[Any], Any], period: Any) -> Any:
             first, second = jax.jvp(slope, (t,), (jnp.ones_like(t),))
             moved = t - first / jnp.where(second == 0, jnp.inf, second)
             t = jnp.clip(moved, start - step, start + step)
-        return jnp.max(jnp.where(jnp.moveaxis(tops, -1, 0) == -jnp.inf, -jnp.inf, sign * function(t)), axis=0)
+        return _largest(jnp.where(jnp.moveaxis(tops, -1, 0) == -jnp.inf, -jnp.inf, sign * function(t)))
 
     return jnp.maximum(largest(1.0) + largest(-1.0), 0.0)
+
+
+@jax.custom_jvp
+def _largest(values: Array) -> Array:
+    """The largest of ``values`` along the first axis; no derivative where equal ones move apart."""
+    return jnp.max(values, axis=0)
+
+
+@_largest.defjvp
+def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (values,), (slopes,) = primals, tangents
+    top, place = jnp.max(values, axis=0), jnp.argmax(values, axis=0)
+    slope = jnp.take_along_axis(slopes, place[None], axis=0)[0]
+    equal = values >= top - _LEVEL * (1 + jnp.abs(top))
+    apart = jnp.any(equal & (jnp.abs(slopes - slope) > _LEVEL + _ALIKE * jnp.abs(slope)), axis=0)
+    return top, jnp.where(apart, jnp.nan, slope)
 
 
 def _moved(b: Any, rho: Any, phase: Any) -> Any:
@@ -332,7 +350,7 @@ def uneven_rotation(beta: Components, phase: Components, ratio: Components, half
 
     shape = jnp.broadcast_shapes(*map(jnp.shape, (*beta, *phase, *ratio)))
     period = jnp.broadcast_to(math.pi * jnp.asarray(half_turns), shape)
-    return _range(speed, period), _range(lead, period) * abs(mean)
+    return range_of(speed, period), range_of(lead, period) * abs(mean)
 
 
 PHASING = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ import drivetrain_jax as dt
 from drivetrain_jax.resonances import Orders, driveline_resonances, orders_of, stored_orders
 from drivetrain_jax.runs.physical import read_table
 from drivetrain_jax.runs.reply import with_unstable_ranges
-from drivetrain_jax.systems.driveline import MOST_TURNS, best_phases, uneven_rotation
+from drivetrain_jax.systems.driveline import MOST_TURNS, best_phases, range_of, uneven_rotation
 from drivetrain_jax.view.style import unstable_text
 from tests.oracles import driveline_reference as oracle
 from tests.quick_jit import quick_jit
@@ -435,6 +435,16 @@ def test_joints_that_cancel_have_no_derivative():
     assert np.isnan([*crossed.beta, *crossed.phase]).all() and crossed.k == (0, 0)
     assert slopes(beta=[0.0, 0.0]).beta == (0, 0)
     np.testing.assert_allclose(slopes(phase=[0.0, np.pi / 2 + 1e-3]).phase, [-0.0805, 0.0805], rtol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("function", "slope"),
+    [(lambda t, p: jnp.cos(4 * t) + p * jnp.cos(2 * t), 1.05), (lambda t, p: p * jnp.cos(2 * t), 2.0)],
+)
+def test_equal_extremes_that_move_apart_have_no_derivative(function, slope):
+    """The ranges are 2 + |p| + p^2/8 and 2 |p|: corners as of joints behind a gear, and of those that cancel."""
+    found = quick_jit(jax.vmap(jax.jacfwd(lambda p: range_of(partial(function, p=p), math.pi))))(jnp.array([0.0, 0.2]))
+    np.testing.assert_allclose(found, [math.nan, slope], rtol=1e-12)
 
 
 def test_the_highest_of_many_peaks_is_found_between_samples():
