@@ -145,10 +145,18 @@ RATTLE = Resonances(
 )
 
 
-# Predicted parametric resonances of a driveline; the joints modulate its matrices twice a turn of the driving end.
+# Predicted parametric resonances of a driveline; each joint modulates its matrices twice a turn of its input.
 
 # Lowest modes with predictions.
 _MODES = 4
+
+
+def joint_speeds(values: Values) -> list[float]:
+    """Speeds of the joints over that of the driving end, rising; without angles every element may have a joint."""
+    count, ratio = len(values.get("k", ())), values.get("ratio") or ()
+    beta = values.get("beta") or (1.0,) * count
+    speeds = np.cumprod([1.0, *np.abs(ratio or np.ones(count))])
+    return sorted({round(float(speed), 12) for speed, angle in zip(speeds, beta, strict=False) if angle != 0})
 
 
 def torsional_frequencies(values: Values) -> np.ndarray:
@@ -162,18 +170,20 @@ def torsional_frequencies(values: Values) -> np.ndarray:
 
 
 def driveline_resonances(orders: int = 2) -> Resonances:
-    """H: omega_i/(2k), S: omega_i/(2k-1), C+: (omega_i + omega_j)/(2k), for i < j; labels end in the order k."""
+    """H: omega_i/(2k), S: omega_i/(2k-1), C+: (omega_i + omega_j)/(2k), for i < j, over the speed of the joints, NaN unless
+    all have one; labels end in the order k."""
     ks, modes = range(1, orders + 1), range(_MODES)
     pairs = [(i, j) for i in modes for j in modes if i < j]
 
     def speeds(values: Values) -> np.ndarray:
-        w = torsional_frequencies(values)
+        turns = joint_speeds(values)
+        w = torsional_frequencies(values) / (turns[0] if len(turns) == 1 else np.nan)
         return parametric_speeds(w, [w[i] + w[j] for i, j in pairs], orders)
 
     single = [f"{kind}{i + 1}{k}" for kind in "HS" for i in modes for k in ks]
     return Resonances(
         axis="speed",
-        parameters=("k", "J"),
+        parameters=("k", "J", "ratio"),
         labels=(*single, *(f"C+{i + 1}{j + 1}{k}" for i, j in pairs for k in ks)),
         values=speeds,
         long_name="predicted parametric resonance",
@@ -269,11 +279,7 @@ def _own_orders(system: str, values: Mapping[str, Any]) -> Orders | None:
         return Orders("shaft", {"order 1": 1.0, "order 2 (joints)": 2.0}, still=discs)
     if system == "driveline":
         # A joint is excited twice a turn of its input, and less by multiples of it.
-        count, ratio = len(values.get("k", ())), values.get("ratio") or ()
-        beta = values.get("beta") or (1.0,) * count
-        speeds = np.cumprod([1.0, *np.abs(ratio or np.ones(count))])
-        turns = sorted({round(float(speed), 12) for speed, angle in zip(speeds, beta, strict=False) if angle != 0})
-        names = {f"order {n * s:.4g} (joints)": n * s for s in turns for n in (2, 4)}
+        names = {f"order {n * s:.4g} (joints)": n * s for s in joint_speeds(values) for n in (2, 4)}
         return Orders("driving end", names) if names else None
     mesh, angles = values.get("carrier_order"), values.get("planet_angle")
     if system == "planetary" and isinstance(mesh, (int, float)) and angles:

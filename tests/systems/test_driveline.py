@@ -526,7 +526,7 @@ def test_branches_over_the_speed_contain_the_steady_states():
 
 def test_unstable_ranges_are_those_between_changes_of_the_verdict(monkeypatch):
     """A wide range, and one that is narrower than the distance of samples, at a predicted resonance."""
-    shaft = {"k": (4e4, 1e4), "J": (0.1, 0.4)}
+    shaft = {"k": (4e4, 1e4), "J": (0.1, 0.4), "ratio": ()}
     found = driveline_resonances(2)
     narrow = found.values(shaft)[found.labels.index("C+121")]
 
@@ -626,11 +626,16 @@ def test_a_table_of_parts_may_be_toml(tmp_path):
 def test_predicted_resonances_are_sums_of_the_frequencies_of_modes():
     case = CASES["ref6"]
     found = driveline_resonances(2)
-    speeds = dict(zip(found.labels, found.values({n: tuple(case[n]) for n in ("k", "J", "ratio")}), strict=True))
+    values = {n: tuple(case[n]) for n in ("k", "J", "ratio")} | {"beta": (0.2, 0.0, 0.0, 0.0, 0.0)}
+    speeds = dict(zip(found.labels, found.values(values), strict=True))
     omega = 2 * math.pi * np.asarray(dt.modes(of_case("ref6"), outputs=["natural_frequency"]).natural_frequency)
     assert speeds["H12"] == pytest.approx(omega[0] / 4)
     assert speeds["S41"] == pytest.approx(omega[3])
     assert speeds["C+132"] == pytest.approx((omega[0] + omega[2]) / 4)
+    # A joint that turns twice as fast meets them at half the speed; joints at several speeds have no common order.
+    behind = found.values(values | {"beta": (0.0, 0.2, 0.0, 0.3, 0.0)})
+    np.testing.assert_allclose(behind, np.array([*speeds.values()]) / 2)
+    assert np.isnan(found.values(values | {"beta": (0.2, 0.2, 0.0, 0.0, 0.0)})).all()
     few = found.values({"k": (4.0,), "J": (1.0,)})
     assert few[found.labels.index("S11")] == pytest.approx(2.0)
     assert np.isnan(few[found.labels.index("S21")])
