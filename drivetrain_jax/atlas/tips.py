@@ -268,7 +268,8 @@ def _predictions(atlas: Atlas, system: type[System]) -> Resonances:
     # One of the two ends of a parameter that moves the resonances needs the higher order.
     values = [_predicted(basic, atlas, end) for end in (atlas.lower, atlas.upper)]
     lowest = atlas.lower[atlas.parameters.index(basic.axis)]
-    order = math.ceil(np.nanmax(values) / max(float(lowest), 1e-300) / 2) + 1
+    # A sum of two frequencies lies at twice the order of either.
+    order = math.ceil(np.nanmax(values) / max(float(lowest), 1e-300))
     return basic.up_to(min(order, _HIGHEST_ORDER))
 
 

@@ -298,6 +298,14 @@ def test_undamped_tongues_start_at_the_resonances(undamped):
     assert found["C+2"].point == {"beta": 0.0, "Omega": pytest.approx((omega1 + omega2) / 4)}
 
 
+def test_sums_of_near_frequencies_are_predicted_up_to_the_lowest_speed(atlas):
+    """The tongue of C+7 grows from (omega1 + omega2)/14 = 0.14375; the orders of single frequencies end at 4."""
+    slow = replace(atlas, lower=np.array([0.0, 0.1425]), fixed={**atlas.fixed, "mu": 0.05, "gamma": 0.05})
+    predicted = naming._predictions(slow, CARDAN)
+    speeds = predicted.values(slow.fixed)
+    assert speeds[predicted.labels.index("C+7")] == pytest.approx(natural_frequencies(0.05, 0.05).sum() / 14)
+
+
 def test_undamped_boundaries_separate_bounded_and_growing_motion(undamped):
     curves = boundaries(undamped.atlas, CARDAN)
     curve = max((c for c in curves if c.multiplier == "-1"), key=lambda c: np.ptp(c.points["beta"]))
