@@ -16,7 +16,7 @@ from drivetrain_jax._errors import InputError, aligned, did_you_mean, meant, sho
 from drivetrain_jax._quantities import NamedResults, Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, analysis_of, get_analysis
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
-from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range, orders_of
+from drivetrain_jax.resonances import FREQUENCIES, SECOND_PLANE, Orders, in_hertz, operating_range, orders_of
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.axes import entry_of
@@ -443,13 +443,13 @@ _FIRST, _FEW = 6, 3
 
 @dataclass(frozen=True)
 class OrderCrossings:
-    """The ``orders`` with their ``speeds`` (modes, orders) [rpm], the operating range [rpm] if one is given, and whether
-    the speeds include the gyroscopic effect."""
+    """The ``orders`` with their ``speeds`` (modes, orders) [rpm], the operating range [rpm] if one is given, and what the
+    speeds include beyond the natural frequencies at rest."""
 
     orders: Orders
     speeds: np.ndarray
     operating: tuple[float, float] | None
-    turning: bool = False
+    including: str = ""
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
@@ -462,8 +462,8 @@ class OrderCrossings:
         modes = [
             [str(k), *(f"{x:.6g}" if np.isfinite(x) else "-" for x in row)] for k, row in enumerate(self.speeds, 1)
         ]
-        how = ", with the gyroscopic effect" if self.turning else ""
-        return [f"  speed of the {self.orders.shaft} at which an order meets the mode{how}", *aligned([head, *modes])]
+        how = f"  speed of the {self.orders.shaft} at which an order meets the mode{self.including}"
+        return [how, *aligned([head, *modes])]
 
     def _whirl_sentence(self, values: Mapping[str, Any], speed: float) -> str:
         """Frequencies of whirl at the ``speed`` [rad/s] of the shaft, by their sense, and critical speeds."""
@@ -502,18 +502,21 @@ def order_crossings(scene: Scene, parameters: Mapping[str, Any], values: Mapping
     operating = operating_range(scene.request.options)
     if orders.still or scene.analysis.name == "whirl":
         orders = replace(orders, per_turn={**orders.per_turn, "order -1 (backward)": -1.0})
-        return OrderCrossings(orders, _turning_speeds(scene, parameters, orders), operating, turning=True)
+        planes = any(parameters.get(name) is not None for name in SECOND_PLANE)
+        speeds = _turning_speeds(scene, parameters, orders, 1 + planes)
+        including = f", with the gyroscopic effect{', counted over both planes' * planes}"
+        return OrderCrossings(orders, speeds, operating, including)
     frequency = in_hertz(values[name], scene.analysis.variable(name).units)
     return OrderCrossings(orders, orders.speeds(frequency), operating)
 
 
-def _turning_speeds(scene: Scene, parameters: Mapping[str, Any], orders: Orders) -> np.ndarray:
+def _turning_speeds(scene: Scene, parameters: Mapping[str, Any], orders: Orders, planes: int) -> np.ndarray:
     """Critical speeds [rpm] of the ``orders`` of a shaft with the gyroscopic effect (modes, orders); NaN where none is."""
     # Local import: other points need no function of a pytree.
     from drivetrain_jax.analyses import analyse
 
-    shaft, modes = scene.system.of(parameters), scene.request.options["modes"]
-    # Half of the modes of whirl are backward.
+    shaft, modes = scene.system.of(parameters), planes * scene.request.options["modes"]
+    # The modes of whirl are those of both senses.
     modes = -(-modes // 2) if scene.analysis.name == "whirl" else modes
     asked = ({"order": int(n), "modes": modes} for n in orders.per_turn.values())
     columns = [analyse("critical_speeds", shaft, ["critical_speed"], options).critical_speed for options in asked]

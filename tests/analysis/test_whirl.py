@@ -18,6 +18,7 @@ import drivetrain_jax as dt
 from drivetrain_jax.analysis.critical_speeds.coupled import directions
 from drivetrain_jax.analysis.critical_speeds.frequency_roots import find_roots
 from drivetrain_jax.analysis.critical_speeds.whirl import _whirl
+from drivetrain_jax.resonances import orders_of
 from drivetrain_jax.systems import Shaft
 from tests.oracles.whirl_reference import whirl
 from tests.sizes import full_after
@@ -309,6 +310,24 @@ def test_equal_planes_whirl_as_one():
     one, two = (dt.point("bicardan", "whirl", modes=8, speed=0.0, **shaft, **more) for more in ({}, {"k_A_y": 1e5}))
     np.testing.assert_allclose(two.whirl_frequency, one.whirl_frequency, rtol=1e-12)
     np.testing.assert_array_equal(two.whirl_direction, one.whirl_direction)
+
+
+def test_natural_frequencies_at_rest_are_those_of_the_first_plane():
+    orders = orders_of("bicardan", {"k_A_y": 2e6, "Ip_A": 0.1})
+    assert orders is not None and orders.still == "without gyroscopic effect and in the first plane"
+    orders = orders_of("bicardan", {"k_joint_y": (0.0,)})
+    assert orders is not None and orders.frequency == "natural frequency at rest, in the first plane"
+
+
+@pytest.mark.full
+def test_orders_meet_the_modes_of_both_planes():
+    """Without discs they are the critical speeds of two shafts, one on the supports of each plane."""
+    shaft = {"length": [0.5], "EI": [2e4], "rhoA": [5.0], "k_A": 1e6, "k_D": 1e6}
+    first, second = (dt.critical_speeds(dt.Bicardan(**shaft | {"k_A": k}), modes=2).critical_speed for k in (1e6, 2e6))
+    range_ = {"operating_min": 0.99 * second[1], "operating_max": 1.01 * second[1]}
+    found = dt.point("bicardan", "critical_speeds", modes=2, **shaft, k_A_y=2e6, **range_)
+    np.testing.assert_allclose(found.crossings["order 1"], np.sort([*first, *second]), rtol=1e-12)
+    assert f"order 1 meets mode 4 at {second[1]:.6g} rpm" in found.sentence
 
 
 def test_wrong_input_is_one_line():
