@@ -300,6 +300,17 @@ def test_a_result_without_a_derivative_spoils_no_other():
     assert known(1.0) == jax.vjp(tangents, 1.0)[1](only)[0] == 2.0
 
 
+def test_a_traced_array_is_a_list_as_a_concrete_one_is():
+    def variation(angles):
+        line = dt.Driveline(beta=angles, speed=100.0, k=[1e4] * 2, c=[0.1] * 2, J=[0.1, 1.0])
+        return dt.phasing(line).speed_variation
+
+    assert jax.eval_shape(jax.vmap(variation), jnp.ones((3, 2))).shape == (3,)
+    lengths = dt.Bicardan.presets["paper"]["length"]
+    traced = jax.jit(lambda x: dt.Bicardan(**dt.Bicardan.presets["paper"] | {"length": x}).length)(jnp.array(lengths))
+    assert isinstance(traced, tuple) and list(map(float, traced)) == list(lengths)
+
+
 def test_an_empty_batch_has_empty_derivatives():
     slopes = jax.vmap(jax.grad(lambda s: dt.floquet(s).spectral_radius))(jax.tree.map(lambda _: jnp.zeros(0), SHAFT))
     assert slopes.beta.shape == (0,)

@@ -501,7 +501,7 @@ def _models(system: type[System], method: Any, marked: Any = None) -> dict[str, 
 
 
 def _admitted(described: Parameter, value: Any) -> Any:
-    """``value`` in its stored type, or :class:`InputError`; arrays and traced values are unchanged."""
+    """``value`` in its stored type, or :class:`InputError`; arrays and traced values are unchanged, except for lists."""
     if value is None:
         if described.default is None and not described.derived:
             raise InputError(f"{described.name}: missing; expected {described.allowed_in_units}")
@@ -509,7 +509,7 @@ def _admitted(described: Parameter, value: Any) -> Any:
     if described.choices or described.text:
         return described.check(value)
     if described.listed and isinstance(value, (np.ndarray, jax.Array)) and value.ndim == 1:
-        value = value if isinstance(value, jax.core.Tracer) else value.tolist()
+        value = list(value) if isinstance(value, jax.core.Tracer) else value.tolist()
     if described.listed and isinstance(value, (list, tuple)):
         one = replace(described, listed=False)
         return tuple(_number(replace(one, name=f"{one.name}[{i}]"), entry) for i, entry in enumerate(value))
