@@ -352,6 +352,16 @@ def test_any_function_is_swept_resumed_and_refused(tmp_path):
     assert dt.sweep(one(2.0), pytree, over=over, out=out, fresh=True).root[1, 1] == 12.0
 
 
+def test_a_subclass_may_declare_a_parameter_anew():
+    base = named("a")
+    anew = type("Anew", (base,), {"__annotations__": {"a": float}, "a": parameter("1", "any", lower=-1.0, default=0.5)})
+    narrow = type("Narrow", (anew,), {"__annotations__": {"a": float}, "a": parameter("1", "any", lower=0.0)})
+    assert [p.lower for p in anew.parameters] == [-1.0] and [p.default for p in narrow.parameters] == [None]
+    assert anew().values == {"a": 0.5} and anew(a=-0.5).a == -0.5
+    with pytest.raises(dt.InputError, match=r"^a = -0\.5: expected 0 <= a"):
+        narrow(a=-0.5)
+
+
 def test_help_and_results_show_what_they_hold():
     text = inspect.getdoc(dt.Cardan) or ""
     assert "zeta: damping ratio of the driving shaft; 0 <= zeta < inf; required." in text

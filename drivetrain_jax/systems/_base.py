@@ -364,7 +364,8 @@ class System(eqx.Module):
         for name in fields:
             if hasattr(System, name) or name == "outcome":
                 raise InputError(f"{cls.__name__}.{name}: a name that every system or result has; expected another one")
-        cls.parameters += tuple(replace(m[_PARAMETER], name=name) for name, m in fields.items() if _PARAMETER in m)
+        own = {name: replace(m[_PARAMETER], name=name) for name, m in fields.items() if _PARAMETER in m}
+        cls.parameters = tuple(({p.name: p for p in cls.parameters} | own).values())
         # For `help`: meaning, range, unit and default of each parameter; the signature has None where there is no default.
         about = []
         for p in cls.parameters:
