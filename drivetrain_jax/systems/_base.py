@@ -313,8 +313,8 @@ class System(eqx.Module):
     Concrete values are checked against their ranges: :class:`~drivetrain_jax.InputError` names the first one out of range.
     Traced values are not checked.
 
-    A model for ``atlas`` without one for ``floquet``, or for ``history`` or ``forced`` without ``state``, raises
-    ``ValueError``.
+    A model for ``atlas`` without one for ``floquet``, one for ``history`` without ``state``, or a :class:`ForcedModel`
+    without ``state`` and ``displacements`` raises ``ValueError``.
     """
 
     #: Name in scenes, ``cardan``.
@@ -382,9 +382,11 @@ class System(eqx.Module):
         _check_names(cls)
         if "atlas" in cls.models and "floquet" not in cls.models:
             raise ValueError(f"models of {cls.name}: atlas needs floquet as well")
-        for analysis, needed in (("history", "state"), ("forced", "state"), ("forced", "displacements")):
-            if analysis in cls.models and not getattr(cls, needed):
-                raise ValueError(f"models of {cls.name}: {analysis} needs {needed}, an attribute of the class")
+        for analysis, model in cls.models.items():
+            orbits = (model.returns or _MODELS.get(analysis)) is ForcedModel
+            for needed in ("state", "displacements") if orbits else ("state",) if analysis == "history" else ():
+                if not getattr(cls, needed):
+                    raise ValueError(f"models of {cls.name}: {analysis} needs {needed}, an attribute of the class")
 
     def __new__(cls, *values: Any, **given: Any) -> Any:
         """A new system; raises :class:`~drivetrain_jax.InputError` for a name that is no parameter."""

@@ -21,7 +21,7 @@ from drivetrain_jax.analysis.history import analysis as history
 from drivetrain_jax.analysis.history import integration
 from drivetrain_jax.analysis.numerics.kernels import options_for_few
 from drivetrain_jax.runs.scene import load_scene
-from drivetrain_jax.systems import Component, Flow, System, serves
+from drivetrain_jax.systems import Component, Flow, ForcedModel, System, serves
 from tests.oracles import tripod_reference as oracle
 from tests.sizes import full_after
 
@@ -237,6 +237,14 @@ def test_a_flow_has_the_components_that_the_system_says():
 def test_a_system_without_a_state_has_no_history():
     with pytest.raises(ValueError, match="models of nameless: history needs state"):
         type("Nameless", (System,), {"name": "nameless", "flow": Lorenz.flow})
+
+
+def test_a_system_without_a_state_has_no_branches_of_orbits():
+    orbits = serves("frequency_response", returns=ForcedModel)(lambda self: None)
+    with pytest.raises(ValueError, match="models of nameless: frequency_response needs state"):
+        type("Nameless", (System,), {"name": "nameless", "orbits": orbits})
+    with pytest.raises(ValueError, match="models of nameless: frequency_response needs displacements"):
+        type("Nameless", (System,), {"name": "nameless", "orbits": orbits, "state": Lorenz.state})
 
 
 def test_derivatives_at_whole_strobes():
