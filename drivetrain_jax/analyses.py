@@ -24,12 +24,12 @@ from jax import Array
 from jax.custom_batching import custom_vmap
 
 from drivetrain_jax import _programs
-from drivetrain_jax._errors import InputError
+from drivetrain_jax._errors import InputError, nearest
 from drivetrain_jax._quantities import NamedResults
 from drivetrain_jax.analysis import OUTCOME, Analysis, Dimension, Outcome, Request, Solver, analysis_of, get_analysis
 from drivetrain_jax.analysis._base import checked_solvers, dimensions_of, make_request
 from drivetrain_jax.analysis.numerics.kernels import compiler_options, options_for_few
-from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lanes_last, path_entry, with_lanes
+from drivetrain_jax.analysis.numerics.lanes import Constants, in_blocks, lanes_last, with_lanes
 from drivetrain_jax.systems import System
 from drivetrain_jax.systems._base import printed, scaled
 
@@ -117,7 +117,12 @@ def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapp
         # Without a scene the names of its tables mean nothing to the caller.
         raise InputError(re.sub(r"^(fixed|options)\.", "", str(error))) from None
     along = analysis.path_axis(type(system), request)
-    leaf = None if along is None else path_entry(values, along)
+    # Copies, because the path is told from other parameters by its identity.
+    values = jax.tree.map(lambda x: x if isinstance(x, str | jax.core.Tracer) else np.array(x, float), values)
+    numbers = {_named(place): x for place, x in jax.tree.leaves_with_path(values) if not isinstance(x, str)}
+    if along is not None and along not in numbers:
+        raise InputError(f"{along}: not a number of {system.name}{nearest(along, numbers)}")
+    leaf = None if along is None else numbers[along]
     if along is not None and isinstance(leaf, jax.core.Tracer):
         raise InputError(f"{along}: a traced array; expected concrete numbers for the path that the analysis follows")
     path = None if along is None else np.atleast_1d(np.asarray(leaf, float))
@@ -128,6 +133,11 @@ def _job(name: str, system: System, outputs: Sequence[str] | None, options: Mapp
     rest = jax.tree.map(lambda x: x if isinstance(x, str) else path if x is leaf else None, values)
     single = along is not None and np.ndim(leaf) == 0  # pyright: ignore[reportArgumentType]
     return _Job(analysis, type(system), request, Constants(rest), along is not None, single, dimensions), parameters
+
+
+def _named(place: Sequence[Any]) -> str:
+    """The parameter, or the entry of a list such as ``planet_angle[1]``, that has this place among the values."""
+    return "".join([str(place[0].key), *(f"[{key.idx}]" for key in place[1:])])
 
 
 def jacobians(

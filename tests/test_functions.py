@@ -311,6 +311,19 @@ def test_a_traced_array_is_a_list_as_a_concrete_one_is():
     assert isinstance(traced, tuple) and list(map(float, traced)) == list(lengths)
 
 
+def test_a_path_is_the_number_that_its_name_says():
+    """And no other parameter that holds the same object."""
+    speeds = np.linspace(0.5, 0.9, 3)
+    with pytest.raises(dt.InputError, match=r"^frequency_response: parameters of the shape \(3,\)"):
+        dt.frequency_response(dt.Rattle(**GEARS.values | {"omega": speeds, "B1": speeds}), method="describing_function")
+    stiffness = 5e8
+    gear = dt.Planetary(k_sp=stiffness, k_rp=stiffness)
+    for track in ("planet_angle", "planet_angle[4]", "k_ps"):
+        with pytest.raises(dt.InputError, match=rf"^{re.escape(track)}: not a number of planetary.*expected") as raised:
+            dt.modes(gear, track=track)
+        assert "\n" not in str(raised.value)
+
+
 def test_an_empty_batch_has_empty_derivatives():
     slopes = jax.vmap(jax.grad(lambda s: dt.floquet(s).spectral_radius))(jax.tree.map(lambda _: jnp.zeros(0), SHAFT))
     assert slopes.beta.shape == (0,)
