@@ -14,6 +14,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
+from drivetrain_jax._errors import InputError
 from drivetrain_jax._quantities import Dimension, count
 from drivetrain_jax.analysis._base import Analysis, Outcome, Request, Solver, forward_derivatives
 from drivetrain_jax.systems import System
@@ -28,6 +29,9 @@ def _solve(
     model = system.models[name]
     with_axis = {v.name for v in model.results if v.dims}
     constants, with_modes = model.build(values), {v.name for v in model.results if v.dims == (MODE,)}
+    for lacking in (result for result in request.outputs if result not in constants):
+        has, declared = ", ".join(constants), ", ".join(v.name for v in model.results)
+        raise InputError(f"{system.__name__}: its model of {name} has {has}, not {lacking}; expected {declared}")
 
     def value(name: str) -> Array:
         if name not in with_axis:

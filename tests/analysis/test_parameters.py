@@ -70,6 +70,14 @@ def test_a_system_declares_its_results():
     assert slope.k == pytest.approx(-math.pi / 8)
 
 
+def test_a_model_without_a_declared_result_is_refused():
+    body = {"name": "idle", "title": "idle", "__annotations__": {"k": float}, "k": parameter("1", "k")}
+    declared = serves("parameters", results=(Variable("period", "s", "period"),))
+    idle = type("Idle", (System,), body | {"constants": declared(lambda self: {"perod": self.k})})
+    with pytest.raises(dt.InputError, match=r"^Idle: its model of parameters has perod, not period; expected period"):
+        analyse("parameters", idle(k=1.0), None, {})
+
+
 def test_a_value_below_its_valid_range_breaks_a_rule():
     ds = dt.point("tripod", "parameters", element="input", beta=0.1)
     chart = dt.run({"system": "tripod", "analysis": "parameters", "fixed": {"element": "input", "beta": 0.1}})
