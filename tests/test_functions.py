@@ -434,6 +434,13 @@ def test_a_sweep_of_an_unregistered_class_has_the_dimensions_of_its_analysis():
     np.testing.assert_allclose(found.height[1], [0.0, -1.0, -4.0], atol=1e-9)
 
 
+def test_a_sweep_along_a_path_needs_a_class_that_is_known_by_name():
+    gears = type("Gears", (dt.Rattle,), {"name": "gears"})(**GEARS.values | {"omega": np.linspace(0.5, 0.9, 3)})
+    for over in ({"omega": [0.5, 0.9]}, {"B1": [0.1, 0.2]}):
+        with pytest.raises(dt.InputError, match=r"^system = Gears: .* dt\.register\(Gears\)"):
+            dt.sweep(dt.frequency_response, gears, over=over, method="describing_function")
+
+
 def test_arrays_inside_a_jitted_function_belong_to_it():
     def gain(table):
         return jax.jit(lambda p: p["a"] * jax.jit(lambda x: jnp.dot(x, x))(np.array(table)))

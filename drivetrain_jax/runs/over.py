@@ -91,6 +91,9 @@ def sweep(
             return run(_scene_table(name, system, over, outputs, options), out=out, fresh=fresh)
         # A scene names its system, so any other class is that of a function.
         request = make_request(type(system), analysis, outputs, options, {*over})
+        if (along := analysis.path_axis(type(system), request)) is not None:
+            own = type(system).__name__
+            raise InputError(f"system = {own}: {name} follows {along}; expected a class after dt.register({own})")
         results, dims = analysis.variables, dimensions_of(analysis, type(system), request, system.values)
     return run(_function_scene(function, system, over, outputs, options, results, dims), out=out, fresh=fresh)
 
