@@ -180,6 +180,8 @@ def _averaged(system: type[System], request: Request, values: Mapping[str, Any],
 def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """All requested results of one point; ``effort`` only orders the batches, as the integration is adaptive."""
     flow: Flow = system.models["history"].build(values)
+    if system.state_axis is None and flow.size != (size := len(system.state)):
+        raise InputError(f"system: its flow has {flow.size} components; expected one for each of its state, {size}")
     history = integrated(flow, request)
     scale = jnp.stack([jnp.asarray(s, float) for s in flow.scale or (1.0,) * flow.size])
     results = _by_component(system, scale * history.states, "") | _by_component(system, scale * history.error, "_error")
@@ -196,16 +198,13 @@ def _by_component(system: type[System], values: Array, suffix: str) -> dict[str,
 
 def _effort(system: type[System], request: Request, most: float, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Predicted segments, shape (N,): strobes or periods, and requested times; infinite beyond ``most`` strobes."""
-    times, size = requested_times(request), None if system.state_axis else len(system.state)
-    strobes = times[-1] / predicted(_period, (system.models["history"].build, size), columns)
+    times = requested_times(request)
+    strobes = times[-1] / predicted(_period, (system.models["history"].build,), columns)
     return np.where(strobes <= most, np.ceil(strobes) + len(times), np.inf)
 
 
-def _period(build: Callable[..., Any], size: int | None, values: Mapping[str, Any]) -> Array:
-    flow = build(values)
-    if isinstance(flow, Flow) and size not in (None, flow.size):
-        raise InputError(f"system: its flow has {flow.size} components; expected one for each of its state, {size}")
-    return jnp.asarray(flow.period)
+def _period(build: Callable[..., Any], values: Mapping[str, Any]) -> Array:
+    return jnp.asarray(build(values).period)
 
 
 def _outcome(flow: Flow, history: History) -> Array:
