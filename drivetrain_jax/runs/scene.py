@@ -184,7 +184,12 @@ def load_scene(source: str | Path | Mapping[str, Any] | Scene, overrides: Mappin
         raise InputError(f"axes.{several.shown.name}: changes {names} together; {allowed}")
     _check_path(scene)
     # The analysis checks that request and parameters match.
-    _ = scene.dimensions
+    taken = [dimension.name for dimension in scene.dimensions]
+    if clash := next((axis for axis in axes if axis.dim in taken), None):
+        where = f"{'points' if zipped else 'axes'}.{clash.shown.name}"
+        raise InputError(
+            f"{where}: {analysis.name} has a dimension {clash.dim!r}; expected a parameter of another name"
+        )
     return scene
 
 

@@ -14,6 +14,7 @@ from flows import lorenz
 from scipy.integrate import solve_ivp
 
 import drivetrain_jax as dt
+from drivetrain_jax import systems
 from drivetrain_jax._errors import InputError
 from drivetrain_jax.analyses import analyse
 from drivetrain_jax.analysis import Outcome, Request
@@ -21,7 +22,7 @@ from drivetrain_jax.analysis.history import analysis as history
 from drivetrain_jax.analysis.history import integration
 from drivetrain_jax.analysis.numerics.kernels import options_for_few
 from drivetrain_jax.runs.scene import load_scene
-from drivetrain_jax.systems import Component, Flow, ForcedModel, System, serves
+from drivetrain_jax.systems import Component, Flow, ForcedModel, System, parameter, serves
 from tests.oracles import tripod_reference as oracle
 from tests.sizes import full_after
 
@@ -235,6 +236,16 @@ def test_a_flow_has_the_components_that_the_system_says():
         InputError, match=r"(?m)^system: its flow has 3 components; expected one for each of its state, 2$"
     ):
         jax.eval_shape(lambda: solver.solve({}, 1))
+
+
+@pytest.mark.parametrize("varying", ["axes", "points"])
+def test_a_parameter_that_is_called_like_a_dimension_does_not_vary(varying, monkeypatch):
+    monkeypatch.setattr(systems, "_REGISTERED", {})
+    body = {"__annotations__": {"time": float}, "time": parameter("1", "a time constant"), "flow": Lorenz.flow}
+    timed = type("Timed", (System,), {"name": "timed", "title": "timed", "state": Lorenz.state} | body)
+    scene = {"system": timed, "analysis": "history", varying: {"time": [1.0, 2.0]}, "options": {"times": [0.0, 1.0]}}
+    with pytest.raises(InputError, match=rf"^{varying}\.time: history has a dimension 'time'; expected a parameter of"):
+        load_scene(scene)
 
 
 def test_a_system_without_a_state_has_no_history():
