@@ -133,7 +133,7 @@ def number(text: str) -> float:
 
 def path(text: str) -> Path:
     """A path; the shell leaves the ~ of --out=~/r.nc alone."""
-    return Path(text).expanduser()
+    return Path(os.path.expanduser(text))
 
 
 def _argument(name: str, metavar: str, text: str, **options: Any) -> tuple[str, dict[str, Any]]:

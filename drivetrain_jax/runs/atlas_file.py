@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -197,7 +198,7 @@ def open_atlas(source: str | Path | xr.Dataset) -> StoredAtlas:
 
 def _content(source: str | Path | xr.Dataset, label: str) -> tuple[dict[str, np.ndarray], Mapping[str, Any]]:
     """Variables and attributes of an atlas; :class:`InputError` for another result, or for a damaged file."""
-    path = Path(source).expanduser() if isinstance(source, (str, Path)) else None
+    path = Path(os.path.expanduser(source)) if isinstance(source, (str, Path)) else None
     changed = checksums.damaged(path) if path and path.exists() else None
     if path and changed == []:
         arrays, attrs = read_plain(path)

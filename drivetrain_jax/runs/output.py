@@ -45,7 +45,7 @@ class Output:
     """
 
     def __init__(self, out: Path, job: Job, store: str | None = None) -> None:
-        self.out, self.job = behind_link(out.expanduser()), job
+        self.out, self.job = behind_link(Path(os.path.expanduser(out))), job
         self.parts = PartsFolder(self.out)
         folder, parts, ending = self.out.parent, self.parts.path, self.out.suffix.lower()
         guess = did_you_mean(ending, (".zarr",)) if ending != ".zarr" else ""
@@ -330,7 +330,7 @@ def open_result(path: str | Path) -> xr.Dataset:
     Traceback (most recent call last):
     drivetrain_jax._errors.InputError: file = 'missing.nc': does not exist; give a result written by `drivetrain run`
     """
-    path = Path(path).expanduser()
+    path = Path(os.path.expanduser(path))
     if path.exists() or not PartsFolder(path).holds_work():
         checksums.refuse_damaged(path)
         return consolidate.open_result(path)

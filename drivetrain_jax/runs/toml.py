@@ -34,7 +34,7 @@ def read(
     if isinstance(source, Mapping):
         tree, text = plain(source), None
     elif isinstance(source, (str, os.PathLike)):
-        text = _text(Path(source).expanduser())
+        text = _text(Path(os.path.expanduser(source)))
         try:
             tree = tomllib.loads(text)
         except (ValueError, RecursionError) as error:

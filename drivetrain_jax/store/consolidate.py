@@ -352,7 +352,7 @@ def open_result(path: Path) -> xr.Dataset:
     """The result at ``path``, loaded into memory; ``InputError`` if it is missing or not readable."""
     import xarray as xr
 
-    path = path.expanduser()
+    path = Path(os.path.expanduser(path))
     attributes(path)
     try:
         with xr.open_dataset(path, engine="h5netcdf", phony_dims="sort") as dataset:

@@ -267,6 +267,15 @@ def test_a_home_folder_may_be_written_as_one(monkeypatch, folder, capsys):
         dt.open_result("~/r.nc")
 
 
+def test_a_name_that_begins_with_a_tilde_may_be_no_user(folder, capsys):
+    """Editors leave such files, and a shell gives an unknown user's name as it is."""
+    assert main(["status", "scene.toml", "--out", "~no-such-user.nc"]) == 0
+    assert "absent: 0 of 9" in capsys.readouterr().out
+    for read in (dt.open_result, dt.open_atlas, dt.run):
+        with pytest.raises(dt.InputError, match="= '~no-such-user"):
+            read("~no-such-user.nc")
+
+
 @pytest.mark.full
 def test_a_point_that_has_not_converged_names_the_option():
     gears = {"omega": 0.7, "B0": 0.05, "B1": 0.03, "b": 0.17, "c": 1e-5, "alpha": 0.25, "k": 1.0, "I": 1.0}
