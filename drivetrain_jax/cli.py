@@ -183,7 +183,7 @@ _COMMANDS: dict[str, tuple[str, tuple[Any, ...]]] = {
     "export": ("write a Zarr store as one HDF5 file, or a result as CSV", (
         _file("store", "RESULT", "a Zarr store, or with --csv a result file on a grid"),
         _file("file", "FILE.nc", "HDF5 file to write", nargs="?"),
-        _argument("--csv", "TABLE.csv", nargs="?", const="",
+        _file("--csv", "TABLE.csv", nargs="?", const=False,
                text="write a table (default: RESULT.csv): one row a point, units in the header, codes as words"),
     )),
     "plot": ("draw the figure of a result", (
@@ -397,7 +397,7 @@ def export(options: argparse.Namespace) -> int:
 
         if options.file:
             raise InputError(f"FILE.nc = {str(options.file)!r}: not used with --csv; expected --csv TABLE.csv")
-        out = Path(options.csv or options.store.with_suffix(".csv"))
+        out = options.csv or Path(f"{os.path.splitext(options.store)[0]}.csv")
         _check_place(out, (".csv",))
         count = write_csv(options.store, out)
     elif options.file is None:

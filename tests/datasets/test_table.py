@@ -32,6 +32,12 @@ def test_every_number_is_in_its_column(file):
     assert list(dataset.drivetrain.table().columns) == list(found.columns)
 
 
+def test_a_home_folder_may_be_written_as_one(file, monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert main(["export", str(file), "--csv=~/t.csv"]) == 0
+    assert (tmp_path / "t.csv").is_file()
+
+
 def test_two_results_are_never_one_column():
     chart = dt.sweep(lambda p: {"y": np.array([1, 2]) * p["x"], "y_1": p["x"]}, {"x": 0.0}, over={"x": [1.0, 2.0]})
     with pytest.raises(dt.InputError, match="table: 'y_1' names two columns"):
@@ -67,6 +73,8 @@ def test_wrong_names_leave_nothing_behind(file, tmp_path, capsys):
         ([str(file), "--csv", str(tmp_path / "t.txt")], "ends in .csv"),
         ([str(file), str(tmp_path / "t.nc"), "--csv"], "not used with --csv"),
         ([str(file)], "FILE.nc: missing"),
+        ([".", "--csv"], "is a folder"),
+        (["/", "--csv"], "ends in .csv"),
     ):
         assert main(["export", *arguments]) == 2
         assert word in capsys.readouterr().err
