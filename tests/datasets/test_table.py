@@ -1,5 +1,8 @@
 """Results as CSV: one row a point, and nothing lost."""
 
+import errno
+import os
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -66,6 +69,15 @@ def test_samples_of_a_history_are_rows(tmp_path):
     assert list(rows.columns) == ["zeta", "time [s]", "phi [rad]", "outcome"]
     np.testing.assert_array_equal(rows["phi [rad]"], found.phi.values.ravel())
     np.testing.assert_array_equal(rows["time [s]"], np.tile(found.time.values, 2))
+
+
+def test_a_disk_that_takes_no_more_is_named(file, tmp_path, monkeypatch, capsys):
+    def full(*given, **how):
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+
+    monkeypatch.setattr(pd.DataFrame, "to_csv", full)
+    assert main(["export", str(file), "--csv", str(tmp_path / "t.csv")]) == 2
+    assert capsys.readouterr().err == f"drivetrain: {tmp_path / 't.csv.tmp'}: File too large\n"
 
 
 def test_wrong_names_leave_nothing_behind(file, tmp_path, capsys):
