@@ -468,8 +468,9 @@ def _check_place(out: Path, endings: tuple[str, ...]) -> None:
 
 
 def _write(out: Path, data: bytes | memoryview) -> int:
-    from drivetrain_jax.store.files import write_atomic
+    from drivetrain_jax.store.files import behind_link, write_atomic
 
+    out = behind_link(out)
     write_atomic(out, data, out.with_name(f"{out.name}.tmp"))
     return OK
 

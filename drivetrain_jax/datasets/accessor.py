@@ -238,12 +238,13 @@ class _Words(BackendArray):
 def write_csv(source: Path, out: Path) -> int:
     """Write the result ``source`` as the table ``out``, see :meth:`DrivetrainAccessor.table`; returns its number of rows."""
     from drivetrain_jax.runs.output import open_result
-    from drivetrain_jax.store.files import move_into_place, naming
+    from drivetrain_jax.store.files import behind_link, move_into_place, naming
 
     dataset = open_result(source)
     if dataset.attrs.get("analysis") == "atlas" or "outcome" not in dataset:
         raise InputError(f"file = {str(source)!r}: holds no values on a grid; expected a chart of it, saved as a file")
-    temporary, table = out.with_name(f"{out.name}.tmp"), dataset.drivetrain.table()
+    out, table = behind_link(out), dataset.drivetrain.table()
+    temporary = out.with_name(f"{out.name}.tmp")
     try:
         with naming(temporary):
             table.to_csv(temporary, index=False, chunksize=_ROWS)

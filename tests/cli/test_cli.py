@@ -575,6 +575,10 @@ def test_plot_writes_the_figure(cli, monkeypatch):
     cli("run", "scene.toml", "--out", "r.nc", "--quiet")
     assert cli("plot", "r.nc", "--out", "f.png")[0] == 0 and open("f.png", "rb").read(4) == b"\x89PNG"
     assert cli("plot", "r.nc", "r.nc", "--out", "two.png")[0] == 0
+    os.symlink("two.png", "link.png")
+    os.truncate("two.png", 0)
+    assert cli("plot", "r.nc", "--out", "link.png")[0] == 0
+    assert os.path.islink("link.png") and os.path.getsize("two.png")
 
     def full(*_):
         raise OSError(28, "No space left on device")

@@ -41,6 +41,12 @@ def test_a_home_folder_may_be_written_as_one(file, monkeypatch, tmp_path):
     assert (tmp_path / "t.csv").is_file()
 
 
+def test_a_link_to_a_table_stays_one(file, tmp_path):
+    (tmp_path / "link.csv").symlink_to(tmp_path / "t.csv")
+    assert main(["export", str(file), "--csv", str(tmp_path / "link.csv")]) == 0
+    assert (tmp_path / "link.csv").is_symlink() and len(pd.read_csv(tmp_path / "t.csv")) == 6
+
+
 def test_two_results_are_never_one_column():
     chart = dt.sweep(lambda p: {"y": np.array([1, 2]) * p["x"], "y_1": p["x"]}, {"x": 0.0}, over={"x": [1.0, 2.0]})
     with pytest.raises(dt.InputError, match="table: 'y_1' names two columns"):
