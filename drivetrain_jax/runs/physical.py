@@ -180,8 +180,8 @@ def _numbers(parameter: Parameter, value: Any, physical: bool) -> Any:
 
 # The column of a table with the names of its rows, and the entry of a scene that holds them.
 _NAMES, PARTS = "part", "parts"
-# Lines in front of a CSV table that begin with # and hold no separator.
-_COMMENT = re.compile(r"\A(?:#[^,;\t\n]*\n)+")
+# Lines in front of a CSV table that begin with # and hold no separator, and empty ones.
+_COMMENT = re.compile(r"\A(?:(?:#[^,;\t\n]*| *)\n)+")
 _HEADER = re.compile(r"\s*(.+?)\s*(?:[\[(]\s*(.*?)\s*[\])])?\s*")
 
 

@@ -49,6 +49,9 @@ def test_a_shaft_from_a_table_has_its_critical_speeds(tmp_path, capsys, kind):
 def test_a_comment_in_front_of_a_table_is_left_out(tmp_path):
     rows = [("# shaft.csv",), *ROWS]
     assert read_table(written(tmp_path / "t.csv", rows=rows)) == read_table(written(tmp_path / "s.csv"))
+    for separator in (",", ";", "\t"):
+        rows = [("",), ("# shaft.csv",), ("  ",), *ROWS]
+        assert read_table(written(tmp_path / "e.csv", separator, rows)) == read_table(tmp_path / "s.csv")
     # A first column of numbers may be called #.
     assert read_table(written(tmp_path / "n.csv", rows=[("#", "k_A"), (1, 2.0)]))["k_A"] == 2.0
 
