@@ -182,7 +182,8 @@ def _numbers(parameter: Parameter, value: Any, physical: bool) -> Any:
 _NAMES, PARTS = "part", "parts"
 # Lines in front of a CSV table that begin with # and hold no separator, and empty ones.
 _COMMENT = re.compile(r"\A(?:(?:#[^,;\t\n]*| *)\n)+")
-_HEADER = re.compile(r"\s*(.+?)\s*(?:[\[(]\s*(.*?)\s*[\])])?\s*")
+# Cells of spreadsheets may have several lines, or only blanks.
+_HEADER = re.compile(r"\s*(\S.*?|)\s*(?:[\[(]\s*(.*?)\s*[\])])?\s*", re.DOTALL)
 
 
 def read_table(path: Path) -> dict[str, Any]:

@@ -56,6 +56,11 @@ def test_a_comment_in_front_of_a_table_is_left_out(tmp_path):
     assert read_table(written(tmp_path / "n.csv", rows=[("#", "k_A"), (1, 2.0)]))["k_A"] == 2.0
 
 
+def test_headers_of_two_lines_and_of_blanks(tmp_path):
+    rows = [('"length\n[mm]"', " ", '"outer\ndiameter"'), (300, "", 60)]
+    assert read_table(written(tmp_path / "t.csv", rows=rows)) == {"length": "300.0 mm", "outer\ndiameter": 60.0}
+
+
 def test_a_scene_overrides_its_table_and_the_command_line_both(tmp_path, capsys):
     scene = tmp_path / "shaft.toml"
     axis = '[axes]\nk_D = { values = [1e6, "5 MN/m"] }\n[fixed]\nk_A = 1e6\n'
