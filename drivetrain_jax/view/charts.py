@@ -370,7 +370,7 @@ def _table(dataset: xr.Dataset) -> Figure:
     axes.set(xlim=(0, 1), ylim=(len(rows) - 0.5, -0.5))
     for k, (label, number, unit) in enumerate(rows):
         axes.text(0, k, label, va="center")
-        axes.text(0.72, k, power_of_ten(number), va="center", ha="right")
+        axes.text(0.72, k, number, va="center", ha="right")
         axes.text(0.74, k, unit, va="center", color=FRAME_GREY)
     return sheet.finish(dataset)
 
@@ -388,7 +388,7 @@ def table_rows(dataset: xr.Dataset) -> list[tuple[str, str, str]]:
             entry = variable[place]
             numbered = zip(variable.dims, place, strict=True)
             labels = [f", {dim} {entry[dim].item() if dim in entry.coords else k}" for dim, k in numbered]
-            value = words[int(entry)].replace("_", " ") if words else f"{entry.item():.6g}"
+            value = words[int(entry)].replace("_", " ") if words else power_of_ten(f"{entry.item():.6g}")
             rows.append((label + "".join(labels), value, "" if units == "1" else units))
     return rows
 

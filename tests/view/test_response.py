@@ -62,6 +62,12 @@ def test_unknown_analysis_is_an_input_error():
         plot(results.forced(Omega=OMEGA).drop_vars("outcome").assign_attrs(analysis="anything"))
 
 
+def test_a_single_point_shows_words_and_powers_of_ten():
+    point = results.chart().isel(beta=0, Omega=0)
+    shown = texts(plot(point.assign(spectral_radius=point.spectral_radius.copy(data=2e-7))))
+    assert {"undecided", "2×10⁻⁷"} <= set(shown)
+
+
 def test_any_result_has_a_table_lines_or_maps():
     """The results of a function that somebody swept, by the number of axes."""
     own = {"analysis": "somebody's own"}
