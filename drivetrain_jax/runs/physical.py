@@ -238,7 +238,7 @@ def _rows(path: Path) -> pd.DataFrame:
         if kind == ".xlsx":
             return pd.read_excel(path, **how)
         if kind == ".toml":
-            parts = pd.DataFrame(tomllib.loads(path.read_text("utf-8"))[_NAMES]).rename(columns={"name": _NAMES})
+            parts = pd.DataFrame(tomllib.loads(path.read_text("utf-8-sig"))[_NAMES]).rename(columns={"name": _NAMES})
             return pd.DataFrame([parts.columns, *parts.to_numpy()]).map(lambda x: x if pd.isna(x) else str(x))
         if kind == ".csv":
             # Spreadsheets write a byte order mark, and semicolons where the comma is a decimal mark. A line such as

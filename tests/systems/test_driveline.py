@@ -613,7 +613,7 @@ def test_a_table_of_parts_may_be_toml(tmp_path):
             name, _, unit = column.partition(" [")
             text = f'"{float(cell)} {unit[:-1]}"' if unit else f'"{cell}"' if "/" in cell else cell
             lines.append(f"{name} = {text}")
-    paths[1].write_text("\n".join(lines))
+    paths[1].write_text("\ufeff" + "\n".join(lines))
     assert read_table(paths[1]) == read_table(paths[0])
     paths[1].write_text("\n".join(line for line in lines if line != 'c = "0.5 N m s/rad"'))
     with pytest.raises(dt.InputError, match="column c has an empty cell between values"):
