@@ -115,7 +115,8 @@ def command() -> str:
     # A prompt or ``python -c`` has no program name, and in a notebook the program is the kernel, not the user's command.
     if program in ("", "-", "-c") or program.startswith("ipykernel"):
         return "notebook" if program.startswith("ipykernel") else "python"
-    return shlex.join([program, *sys.argv[1:]])
+    # A file stores UTF-8, and names of files may be other bytes.
+    return shlex.join([program, *sys.argv[1:]]).encode(errors="backslashreplace").decode()
 
 
 def source_digest(files: Mapping[str, Path]) -> str:

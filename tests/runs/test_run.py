@@ -362,6 +362,13 @@ def test_a_finished_result_in_a_folder_without_write_permission_is_read(grid_sce
     assert os.listdir(tmp_path) == ["r.nc"]
 
 
+def test_a_name_that_is_not_utf8_names_a_result(grid_scene, tmp_path, monkeypatch):
+    path = tmp_path / os.fsdecode(b"\xff.nc")
+    monkeypatch.setattr(sys, "argv", ["drivetrain", "run", "scene.toml", "--out", str(path)])
+    run_to_file(grid_scene, path)
+    assert r"\udcff.nc" in dt.open_result(path).attrs["history"]
+
+
 def test_a_link_stays_a_link_and_has_the_lock_of_its_file(grid_scene, tmp_path):
     (tmp_path / "data").mkdir()
     path, link = tmp_path / "data" / "r.nc", tmp_path / "link.nc"
