@@ -52,12 +52,10 @@ class ResultBuffer:
         """Write the results of ``points``."""
         grid = self._grid
         for name, array in self.lay_out(results).items():
-            # A fixed path parameter is not a dimension of the result.
-            values = results[name][:, 0] if grid.path_is_fixed else results[name]
             if grid.path_position is None:
-                array.reshape(grid.size, *array.shape[len(grid.shape) :])[points] = values
+                array.reshape(grid.size, *array.shape[len(grid.shape) :])[points] = results[name]
             else:
-                sweep_first(array, grid)[grid.place(points)] = values
+                sweep_first(array, grid)[grid.place(points)] = results[name]
         self.release_after(results)
 
     def block(self, place: tuple[slice, ...], like: Arrays) -> dict[str, np.ndarray]:
@@ -232,9 +230,7 @@ class ZarrBlocks:
         position, arrays = grid.path_position, {}
         sizes = [part.stop - part.start for axis, part in enumerate(box) if axis != position]
         for name, values in results.items():
-            # A fixed path parameter is not a dimension of the result.
-            rows = values[:, 0] if grid.path_is_fixed else values
-            rows = rows.reshape((*sizes, *rows.shape[1:]))
+            rows = values.reshape((*sizes, *values.shape[1:]))
             arrays[name] = rows if position is None else np.moveaxis(rows, len(sizes), position)
         zarr_store.write(Path(self.place), box, arrays, number)
 
@@ -244,8 +240,7 @@ class ZarrBlocks:
         if shard is None:
             return None
         moved = {name: sweep_first(values, grid) for name, values in shard.items()}
-        rows = {name: values.reshape(-1, *values.shape[len(grid.shape) :]) for name, values in moved.items()}
-        return {name: values[:, None] if grid.path_is_fixed else values for name, values in rows.items()}
+        return {name: values.reshape(-1, *values.shape[len(grid.shape) :]) for name, values in moved.items()}
 
     def finish(self, parts: PartsFolder, **attrs: str | float) -> None:
         """Move the store into place. A former one is moved away first, because a folder cannot be replaced in one step.

@@ -166,7 +166,9 @@ class Job:
         self.prepare([chunk])
         try:
             kernel = self._kernels[chunk.solver, chunk.size].result()
-            return kernel(self.grid.columns(chunk.points), self.grid.numbers, chunk.effort)
+            results = kernel(self.grid.columns(chunk.points), self.grid.numbers, chunk.effort)
+            # A fixed path parameter is not a dimension of the result.
+            return {n: x[:, 0] for n, x in results.items()} if self.grid.path_is_fixed else results
         except InputError as error:
             # The error of a model or of an analysis, the same for all chunks.
             raise ChunkError(str(error)) from error
@@ -185,7 +187,7 @@ class Job:
         """The results of all ``chunks`` of a block in the order of its points; others have no value."""
         count, joined = len(self.points(block)), {}
         rows = np.concatenate([np.empty(0, np.int64), *(chunk.rows for chunk in chunks)])
-        line, outer = (self.grid.path_length,) * (self.grid.path is not None), len(self.grid.result_shape)
+        line, outer = (self.grid.path_length,) * (self.grid.path_position is not None), len(self.grid.result_shape)
         like = blank(self.problem, self.grid, results[0] if results else None)
         for variable in result_variables(self.problem):
             missing = Outcome.STEP_LIMIT if variable.name == OUTCOME.name else variable.missing

@@ -62,8 +62,6 @@ class ReusableResult:
         for start in range(0, self.ours.size, _BLOCK):
             points = self.theirs[start : start + _BLOCK]
             results = {name: _rows(array, self.grid, points) for name, array in arrays.items()}
-            if self.grid.path_is_fixed:
-                results = {name: values[:, None] for name, values in results.items()}
             yield self.ours[start : start + _BLOCK], results
 
 
