@@ -380,7 +380,7 @@ def speed_windows(
         effects = [limit_line(asked, speed, limit, f"    at the {end} end: ") for end, limit in places]
         lines += [text for text, _ in effects if text]
         sensitivities.append([effect for _, effect in effects])
-        lines += [f"    {text}" for text in compared[k]]
+        lines += [f"    {text}" for text in compared[k : k + 1]]
     proofs, proved = asked.proofs()
     data = {
         "question": "speed_windows",
@@ -546,7 +546,7 @@ def _answered(title: str, phrase: str, safe: str, asked: AtlasQuery, answer: des
     compared, forced = forced_over(
         asked.atlas, amplitude, speeds, {**asked.numbers(), name: answer.value or 0.0}, asked.named
     )
-    lines += [f"  {text}" for each in compared for text in each]
+    lines += [f"  {text}" for text in compared]
     data = {
         "question": title.replace(" ", "_"),
         "parameters": {**asked.atlas.fixed, **asked.values},

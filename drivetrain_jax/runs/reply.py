@@ -11,6 +11,7 @@ import math
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -420,16 +421,32 @@ class Limit:
         return text, data | {"within": within}
 
     def along(
-        self, amplitude: Callable[[np.ndarray], np.ndarray], low: float, high: float, likely: np.ndarray
-    ) -> Along:
-        """The amplitudes along the speeds from ``low`` to ``high``; ``amplitude`` returns those of all displacements.
+        self,
+        amplitude: Callable[[np.ndarray], np.ndarray],
+        low: float,
+        high: float,
+        likely: np.ndarray,
+        named: Callable[[float], str],
+    ) -> tuple[str, dict[str, Any]]:
+        """The largest amplitude along the speeds from ``low`` to ``high``, and the speeds within the limit: text and data.
 
-        ``likely`` are speeds near peaks, which may be narrower than the distance of the samples.
+        ``amplitude`` returns those of all displacements, ``named`` writes a speed. ``likely`` are speeds near peaks, which
+        may be narrower than the distance of the samples.
         """
         x, y = _sampled(amplitude, low, high, likely, self.value, _LIMIT_ROUNDS)
         size = np.max(y, axis=1)
         k = int(np.argmax(size))
-        return Along(self, float(size[k]), float(x[k]), self.names[int(np.argmax(y[k]))], runs(x, size <= self.value))
+        largest, where, name = float(size[k]), float(x[k]), self.names[int(np.argmax(y[k]))]
+        within = runs(x, size <= self.value)
+        text, limit = f"at most {self.written(largest)} ({name} at {named(where)})", self.written(self.value)
+        if largest <= self.value:
+            text += f": within the limit of {limit}"
+        else:
+            ranges = ", ".join(f"{named(a)} to {named(b)}" for a, b in within)
+            kept = f"within the limit from {ranges}" if ranges else "above it at all of these speeds"
+            text += f": above the limit of {limit}; {kept}"
+        data = {"limit": self.value, "units": self.own, "largest": largest, "where": where, "displacement": name}
+        return text, data | {"within": [list(ends) for ends in within]}
 
 
 def _sampled(
@@ -507,34 +524,6 @@ def _refined(
     return x[order], y[order]
 
 
-@dataclass(frozen=True)
-class Along:
-    """The ``largest`` amplitude of a range of speeds, that of the displacement ``name`` at ``where``, and the ranges of
-    speed ``within`` the limit."""
-
-    limit: Limit
-    largest: float
-    where: float
-    name: str
-    within: tuple[tuple[float, float], ...]
-
-    def text(self, named: Callable[[float], str]) -> str:
-        """The amplitudes as text; ``named`` writes a speed."""
-        most = f"at most {self.limit.written(self.largest)} ({self.name} at {named(self.where)})"
-        if self.largest <= self.limit.value:
-            return f"forced amplitude {most}: within the limit of {self.limit.written(self.limit.value)}"
-        ranges = ", ".join(f"{named(a)} to {named(b)}" for a, b in self.within)
-        kept = f"within the limit from {ranges}" if ranges else "above it at all of these speeds"
-        return f"forced amplitude {most}: above the limit of {self.limit.written(self.limit.value)}; {kept}"
-
-    @property
-    def data(self) -> dict[str, Any]:
-        """The amplitudes as plain numbers."""
-        place = {"largest": self.largest, "where": self.where, "displacement": self.name}
-        within = [list(ends) for ends in self.within]
-        return {"limit": self.limit.value, "units": self.limit.own, **place, "within": within}
-
-
 def forced_at(atlas: Any, amplitude: Any, point: Mapping[str, float], verdict: Any) -> tuple[list[str], dict[str, Any]]:
     """The comparison of a stored atlas with a limit at one ``point``, as lines and as data; empty without a limit."""
     if amplitude is None:
@@ -548,10 +537,10 @@ def forced_at(atlas: Any, amplitude: Any, point: Mapping[str, float], verdict: A
 
 def forced_over(
     atlas: Any, amplitude: Any, ranges: list[Any], at: Mapping[str, float], named: Callable[[str, float], str]
-) -> tuple[list[list[str]], dict[str, Any]]:
-    """The comparison with a limit in ``ranges`` of speed: lines for each, and data; no lines without a limit."""
+) -> tuple[list[str], dict[str, Any]]:
+    """The comparison with a limit in ``ranges`` of speed: a line for each, and data; no lines without a limit."""
     if amplitude is None:
-        return [[] for _ in ranges], {}
+        return [], {}
     system = atlas.scene.system
     limit, speed, predicted = Limit.from_text(system, amplitude), system.roles["speed"], system.resonances
 
@@ -565,7 +554,5 @@ def forced_over(
         forced = tuple(family.prefix for family in predicted.families if family.forced)
         excited = [bool(forced) and label.startswith(forced) for label in predicted.labels]
         likely = np.asarray(predicted.values({**atlas.fixed, **at}), float)[np.array(excited)]
-    compared = [limit.along(amplitudes, low, high, likely) for low, high in ranges]
-    return [[along.text(lambda x: named(speed, x))] for along in compared], {
-        "forced": [along.data for along in compared]
-    }
+    compared = [limit.along(amplitudes, low, high, likely, partial(named, speed)) for low, high in ranges]
+    return [f"forced amplitude {text}" for text, _ in compared], {"forced": [data for _, data in compared]}

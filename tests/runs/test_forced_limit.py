@@ -27,30 +27,31 @@ def test_ranges_within_a_limit_follow_the_resonance_curve():
         size = 1e-3 / np.hypot(1 - r**2, 2 * damping * r)
         return np.stack([size / 2, size], axis=-1)
 
-    found = TWO.along(amplitude, 0.5, 1.5003, np.array([1.0001]))
+    text, found = TWO.along(amplitude, 0.5, 1.5003, np.array([1.0001]), "{:.6g}".format)
     ratio = 1e-3 / TWO.value
     # (1 - r^2)^2 + (2 D r)^2 = ratio^2 as a quadratic equation of r^2.
     half = 1 - 2 * damping**2
     roots = np.sqrt(half + np.array([-1, 1]) * math.sqrt(half**2 - 1 + ratio**2))
-    (low, inner), (outer, high) = found.within
-    assert (low, high) == (0.5, 1.5003) and found.name == "driven"
+    (low, inner), (outer, high) = found["within"]
+    assert (low, high) == (0.5, 1.5003) and found["displacement"] == "driven"
     np.testing.assert_allclose([inner, outer], roots, atol=3e-4)
     assert amplitude(np.array([inner, outer])).max() <= TWO.value
-    assert found.largest > 4.0 and found.where == pytest.approx(1.0, abs=2e-4)
-    assert "above the limit of 2 deg; within the limit from 0.5 to " in found.text(lambda r: f"{r:.6g}")
+    assert found["largest"] > 4.0 and found["where"] == pytest.approx(1.0, abs=2e-4)
+    assert "above the limit of 2 deg; within the limit from 0.5 to " in text
 
 
 @pytest.mark.parametrize("damping", [1e-3, 1e-5, 1e-7])
 def test_the_largest_amplitude_is_that_of_a_sharp_peak(damping):
     """The curve has its peak 1/(2 D sqrt(1 - D^2)) up to a million times narrower than the distance of the samples."""
-    found = TWO.along(lambda r: 1 / np.hypot(1 - r**2, 2 * damping * r)[:, None], 0.5, 1.5003, np.array([1.0001]))
-    assert found.largest * 2 * damping == pytest.approx(1.0, rel=1e-3)
+    likely = np.array([1.0001])
+    _, found = TWO.along(lambda r: 1 / np.hypot(1 - r**2, 2 * damping * r)[:, None], 0.5, 1.5003, likely, str)
+    assert found["largest"] * 2 * damping == pytest.approx(1.0, rel=1e-3)
 
 
 def test_a_curve_below_the_limit_is_within_it():
-    found = TWO.along(lambda r: np.full((r.size, 2), 0.01), 1.0, 2.0, np.empty(0))
-    assert found.within == ((1.0, 2.0),) and "within the limit of 2 deg" in found.text(str)
-    assert TWO.along(lambda r: np.full((r.size, 2), 1.0), 1.0, 2.0, np.empty(0)).within == ()
+    text, found = TWO.along(lambda r: np.full((r.size, 2), 0.01), 1.0, 2.0, np.empty(0), str)
+    assert found["within"] == [[1.0, 2.0]] and "within the limit of 2 deg" in text
+    assert TWO.along(lambda r: np.full((r.size, 2), 1.0), 1.0, 2.0, np.empty(0), str)[1]["within"] == []
 
 
 @pytest.mark.full
