@@ -182,17 +182,11 @@ class AtlasQuery:
     def physical(self, values: Mapping[str, float | Range]) -> dict[str, Any]:
         """``values`` in the physical units of the input; empty without physical input."""
         physical = {}
-        if self.shaft is None:
-            return physical
         for name, value in values.items():
-            ends = [self.shaft.quantity(name, end) for end in (value if isinstance(value, tuple) else (value,))]
-            known = [end for end in ends if end is not None]
-            if known:
-                numbers = [number for _, number, _ in known]
-                physical[known[0][0]] = {
-                    "value": numbers if isinstance(value, tuple) else numbers[0],
-                    "units": known[0][2],
-                }
+            if self.shaft and (back := self.shaft.back(name)):
+                quantity, convert = back
+                numbers = np.asarray(convert(np.asarray(value))).tolist()
+                physical[quantity.name] = {"value": numbers, "units": quantity.units}
         return physical
 
 
