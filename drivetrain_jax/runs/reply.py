@@ -268,11 +268,10 @@ def _of_data(
     data: dict[str, Any] = {name: value for name, value in point.items() if name != without}
     if shaft:
         follow = {rule.parameter: rule.needs for rule in shaft.physical.conversions}
-        quantities = {name: shaft.quantity(name, value) for name, value in point.items()}
-        ends = {known[0]: known[1] for name, known in quantities.items() if known and name != without}
-        numbers = {name: x for name, x in shaft.data.items() if isinstance(x, (int, float)) and not isinstance(x, bool)}
+        ends = [known for name, value in data.items() if (known := shaft.quantity(name, value))]
+        numbers = {name: x for name, x in shaft.data.items() if isinstance(x, (int, float))}
         given = {name: x for name, x in numbers.items() if name in shaft.physical.names}
-        given = {**given, **ends}
+        given |= {name: x for name, x, _ in ends}
         given.pop(follow[without][0] if without in follow else "", None)
         known = {name for name, needs in follow.items() if set(needs) <= given.keys()}
         used = {need for name in known for need in follow[name]}
