@@ -126,6 +126,11 @@ def entry_of(name: str) -> tuple[str, int | None]:
     return (match.group(1), int(match.group(2))) if match else (name, None)
 
 
+def placed(whole: Any, entry: int | None, value: Any) -> Any:
+    """The list ``whole`` with ``value`` as this ``entry``; ``value`` itself without one."""
+    return value if entry is None else (*whole[:entry], value, *whole[entry + 1 :])
+
+
 def axis_values(table: AxisTable, field: str, continuous: bool = False) -> np.ndarray:
     """The values of an axis, its two ends if it is ``continuous``."""
     keys = [key for key in table.__struct_fields__ if getattr(table, key) is not None]
@@ -271,10 +276,7 @@ class Grid:
             varying.append((self.path, self.path.values))
         for axis, value in varying:
             name = axis.parameter.name
-            if axis.entry is None:
-                values[name] = value
-            else:
-                values[name] = (*values[name][: axis.entry], value, *values[name][axis.entry + 1 :])
+            values[name] = placed(values.get(name), axis.entry, value)
         # The model computes a derived parameter that is not given.
         return {name: values[name] for name in self.parameters if name in values}
 

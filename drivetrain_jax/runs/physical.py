@@ -16,7 +16,7 @@ from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError, clipped, shown
 from drivetrain_jax._quantities import Parameter
 from drivetrain_jax.analysis._base import checked
-from drivetrain_jax.runs.axes import Axis, entry_of
+from drivetrain_jax.runs.axes import Axis, entry_of, placed
 from drivetrain_jax.systems import PhysicalData, System
 from drivetrain_jax.systems._base import Along
 
@@ -48,10 +48,9 @@ def with_parameters(
         given, wanted = axis.parameter.units, described_as[base].units
         size = 1 if given == wanted else _units.factor(given, wanted)
         value = Along(_POINT if zipped else axis.name, axis.values * size)
-        if entry is None:
-            known[base] = value
-        elif isinstance(whole := known.get(base), tuple) and entry < len(whole):
-            known[base] = (*whole[:entry], value, *whole[entry + 1 :])
+        whole = known.get(base)
+        if entry is None or (isinstance(whole, tuple) and entry < len(whole)):
+            known[base] = placed(whole, entry, value)
         elif axis in swept:
             text = f" = {shown(fixed[base])}" if base in fixed else ": missing"
             allowed = f"{base}[0] to {base}[{len(whole) - 1}]" if isinstance(whole, tuple) else "a list of numbers"

@@ -26,6 +26,7 @@ from drivetrain_jax.analyses import jacobians
 from drivetrain_jax.analysis import Analysis
 from drivetrain_jax.analysis._base import checked
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
+from drivetrain_jax.runs.axes import placed
 from drivetrain_jax.runs.physical import GivenData, described
 from drivetrain_jax.runs.predicted import LABELS, resonances
 from drivetrain_jax.runs.scene import Scene
@@ -208,13 +209,9 @@ def point_sensitivities(
 
     def entries(x: Any) -> Any:
         """The parameters of ``keys`` at the values ``x`` of ``leaves``."""
-        everything: dict[str, Any] = {name: list(y) if isinstance(y, tuple) else y for name, y in data.items()}
+        everything = dict(data)
         for (name, entry, _), y in zip(leaves, x, strict=True):
-            if entry is None:
-                everything[name] = y
-            else:
-                everything[name][entry] = y
-        everything = {name: tuple(y) if isinstance(y, list) else y for name, y in everything.items()}
+            everything[name] = placed(everything[name], entry, y)
         if system.physical:
             everything |= system.physical.converted({name: everything[name] for name in pool})
         return jnp.stack([everything[name] if entry is None else everything[name][entry] for name, entry in keys])

@@ -19,7 +19,7 @@ from drivetrain_jax._quantities import Dimension, Variable
 from drivetrain_jax.analysis import OUTCOME, Analysis, Request, Solver, analysis_of, get_analysis
 from drivetrain_jax.analysis._base import checked, checked_solvers, dimensions_of, make_request
 from drivetrain_jax.runs import toml
-from drivetrain_jax.runs.axes import MAX_RANGES, Axis, axis_table, axis_values, check_total, entry_of
+from drivetrain_jax.runs.axes import MAX_RANGES, Axis, axis_table, axis_values, check_total, entry_of, placed
 from drivetrain_jax.runs.physical import described, with_parameters
 from drivetrain_jax.systems import System, get_system, register
 
@@ -262,8 +262,7 @@ def _extremes(fixed: Mapping[str, Any], axes: tuple[Axis, ...]) -> list[dict[str
     zeros = dict(known)
     for part in parts:
         if part.entry is not None and not part.values.all():
-            whole = zeros[part.parameter.name]
-            zeros[part.parameter.name] = (*whole[: part.entry], 0.0, *whole[part.entry + 1 :])
+            zeros[part.parameter.name] = placed(zeros[part.parameter.name], part.entry, 0.0)
     return [known, zeros] if zeros != known else [known]
 
 

@@ -25,7 +25,7 @@ from drivetrain_jax.atlas import (
 )
 from drivetrain_jax.atlas.construction import MAX_SOLVES
 from drivetrain_jax.runs.assemble import ResultBuffer
-from drivetrain_jax.runs.axes import Axis, Grid
+from drivetrain_jax.runs.axes import Axis, Grid, placed
 from drivetrain_jax.runs.job import Job
 from drivetrain_jax.runs.reuse import ReusedPoints
 from drivetrain_jax.runs.scene import Problem, Ranges, Scene
@@ -218,8 +218,8 @@ def fixed_of(scene: Scene, ranges: Mapping[str, tuple[float, float]]) -> dict[st
     varying = [part for axis in scene.axes for part in axis.together if part.name not in ranges]
     fixed: dict[str, Any] = {**scene.fixed}
     for part in varying:
-        name, value, entry = part.parameter.name, part.values[0].item(), part.entry
-        fixed[name] = value if entry is None else (*fixed[name][:entry], value, *fixed[name][entry + 1 :])
+        name = part.parameter.name
+        fixed[name] = placed(fixed.get(name), part.entry, part.values[0].item())
     return {name: fixed[name] for name in scene.system.models[SOLVES.name].parameters if name in fixed}
 
 
