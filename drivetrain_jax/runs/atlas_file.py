@@ -275,7 +275,7 @@ class StoredAtlas:
 
     def viewed_as(self, name: str, *values: Any) -> tuple[Any, ...]:
         """The quantity that is shown for a parameter, or the parameter itself, and ``values`` of it."""
-        quantity, convert = self.views.get(name) or (self.scene.system.parameter(name), _same)
+        quantity, convert = self.views.get(name) or (self.scene.system.parameter(name), lambda value: value)
         return quantity, *map(convert, values)
 
     def viewed(self, given: Mapping[str, Any], named: Container[str] = ()) -> StoredAtlas:
@@ -288,8 +288,8 @@ class StoredAtlas:
         views: dict[str, View] = {}
         for name in self.parameters:
             back = data.back(name) if data and name not in given and name not in named else None
-            quantity, convert = back or (None, _same)
-            if quantity and (name in units or quantity.name in given or quantity.name in named):
+            if back and (name in units or back[0].name in given or back[0].name in named):
+                quantity, convert = back
                 written = np.asarray(given.get(quantity.name, "")).dtype.kind == "U"
                 unit = units.get(name, quantity.units) if written else quantity.units
                 views[name] = in_unit(quantity, unit), partial(_scaled, convert, 1 / factor(unit, quantity.units))
@@ -516,10 +516,6 @@ class StoredAtlas:
         fixed = dict(scene.fixed) | {name: value for name, value in fixed.items() if name not in axes}
         floquet = get_analysis("floquet").for_system(system)
         return Scene(system, floquet, request, columns, zipped, fixed, scene.title, scene.text, scene.data)
-
-
-def _same(value: Any) -> Any:
-    return value
 
 
 def _scaled(convert: Callable[[Any], Any], size: float, values: Any) -> Any:
