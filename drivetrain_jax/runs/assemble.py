@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,12 +19,12 @@ from drivetrain_jax._machine import machine
 from drivetrain_jax._programs import PACKAGES
 from drivetrain_jax.analysis import OUTCOME, Outcome
 from drivetrain_jax.runs.axes import Grid
+from drivetrain_jax.runs.physical import described
 from drivetrain_jax.runs.scene import Problem, Scene, restore_scene, result_variables
 from drivetrain_jax.store import zarr_store
 from drivetrain_jax.store.consolidate import CONVENTIONS, Entry, Labelled, ResultFile, release
 from drivetrain_jax.store.files import command, flush_tree, move_folder, now, versions
 from drivetrain_jax.store.parts import Arrays, PartsFolder
-from drivetrain_jax.systems import PhysicalData
 
 if TYPE_CHECKING:
     from drivetrain_jax.runs.job import Block, Job
@@ -144,16 +144,13 @@ def _finite(value: Any) -> Any:
 
 def result_attrs(scene: Scene) -> dict[str, str]:
     """Attributes of the result that do not depend on the single run."""
-    fixed: dict[str, Any] = {}
-    for name, value in scene.fixed.items():
-        parameter = scene.system.parameter(name)
-        fixed[name] = {"value": _finite(value), "units": parameter.units, "long_name": parameter.long_name}
-    physical, data = cast(PhysicalData, scene.system.physical), {}
-    for name, value in scene.data.items():
-        quantity = physical.quantity(name)
-        data[name] = {"value": value, "units": quantity.units, "long_name": quantity.long_name}
-    # Figures need the state, families of resonances, and periods of the equations in a turn.
     system = scene.system
+    known = described(system)
+    fixed, data = (
+        {n: {"value": _finite(x), "units": known[n].units, "long_name": known[n].long_name} for n, x in values.items()}
+        for values in (scene.fixed, scene.data)
+    )
+    # Figures need the state, families of resonances, and periods of the equations in a turn.
     families = system.resonances.families if system.resonances else ()
     drawn: dict[str, Any] = {
         "state": [vars(component) for component in system.state],
@@ -163,16 +160,16 @@ def result_attrs(scene: Scene) -> dict[str, str]:
     drawn |= {"periods_per_turn": system.periods_per_turn} if system.periods_per_turn else {}
     # An axis given in physical data takes the role of its parameter.
     dim_of = {axis.name: axis.dim for axis in scene.axes if axis.given}
-    roles = {role: dim_of.get(name, name) for role, name in scene.system.roles.items()}
+    roles = {role: dim_of.get(name, name) for role, name in system.roles.items()}
     installed, created, version = versions((*PACKAGES, "h5py")), now(), drivetrain_jax.__version__
-    cited = {"references": scene.system.source} if scene.system.source else {}
+    cited = {"references": system.source} if system.source else {}
     return {
         "Conventions": CONVENTIONS,
         "title": scene.title,
         "source": f"drivetrain_jax {version}",
         "history": f"{created}: {command()}",
         **cited,
-        "system": scene.system.name,
+        "system": system.name,
         "roles": json.dumps(roles),
         **drawn,
         "analysis": scene.analysis.name,
