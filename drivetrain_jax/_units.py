@@ -89,6 +89,11 @@ def number(text: str, units: str) -> float:
     return value * factor(unit, units)
 
 
+def behind(units: str) -> str:
+    """`` units`` as they follow a number in a text; nothing for a pure number."""
+    return "" if units in ("1", "") else f" {units}"
+
+
 def with_unit(value: Any) -> Any:
     """``value`` as texts such as ``"18 deg"`` if it brings a unit, as a coordinate or a quantity of pint does."""
     unit = getattr(value, "attrs", {}).get("units") if hasattr(value, "attrs") else getattr(value, "units", None)

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._units import behind
 from drivetrain_jax.atlas.interpolation import coefficients, evaluate, tensor_nodes
 from drivetrain_jax.atlas.panels import Atlas, Panel, to_arrays
 from drivetrain_jax.systems import Coordinate, FloquetModel, System
@@ -148,7 +149,7 @@ def _fixed(system: type[System], shaft: GivenData | None, name: str, value: Any)
     known = shaft.quantity(name, value) if shaft and isinstance(value, float) else None
     label, number, units = known or (name, value, system.parameter(name).units)
     shown = f"{number:.6g}" if isinstance(number, float) else json.dumps(value)
-    return f"{label} = {shown}{'' if units == '1' else f' {units}'}"
+    return f"{label} = {shown}{behind(units)}"
 
 
 def _given(stored: StoredAtlas) -> dict[str, str]:

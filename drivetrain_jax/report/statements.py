@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from drivetrain_jax._units import behind
 from drivetrain_jax.resonances import FREQUENCIES, operating_range, stored_orders
 from drivetrain_jax.view.charts import growth_of, role, valid
 from drivetrain_jax.view.style import (
@@ -109,7 +110,7 @@ def _about_numbers(dataset: xr.Dataset, variable: xr.DataArray) -> Iterator[str]
         return
     name = _capital(variable.attrs.get("long_name", variable.name))
     if dataset["outcome"].size == 1:
-        yield f"{name}: {', '.join(map(digits, variable.values.ravel()))}{_unit(variable)}."
+        yield f"{name}: {', '.join(map(digits, variable.values.ravel()))}{behind(units_of(variable))}."
         return
     for k in range(variable.sizes[inner[0]] if inner else 1):
         part = variable.isel({inner[0]: k}) if inner else variable
@@ -118,7 +119,7 @@ def _about_numbers(dataset: xr.Dataset, variable: xr.DataArray) -> Iterator[str]
         finite = np.ma.masked_invalid(part.values)
         label = f", {str(inner[0]).replace('_', ' ')} {_label(variable, inner[0], k)}" if inner else ""
         places = [np.unravel_index(int(f()), part.shape) for f in (finite.argmin, finite.argmax)]
-        low, high = (f"{digits(part.values[place])}{_unit(variable)}" for place in places)
+        low, high = (f"{digits(part.values[place])}{behind(units_of(variable))}" for place in places)
         if finite.min() == finite.max():
             yield f"{name}{label}: {low} throughout."
             continue
@@ -201,7 +202,7 @@ def _about_errors(dataset: xr.Dataset) -> Iterator[str]:
         if str(name).endswith("_error") and variable.dtype.kind == "f" and np.isfinite(variable.values).any():
             middle, largest = np.nanmedian(variable.values), np.nanmax(variable.values)
             name = _capital(variable.attrs.get("long_name", name))
-            yield f"{name}: median {middle:.2g}, at most {largest:.2g}{_unit(variable)}."
+            yield f"{name}: median {middle:.2g}, at most {largest:.2g}{behind(units_of(variable))}."
 
 
 def _about_orders(dataset: xr.Dataset) -> Iterator[str]:
@@ -237,11 +238,6 @@ def _label(variable: xr.DataArray, dim: Any, k: int) -> str:
 
 def _capital(text: object) -> str:
     return str(text)[:1].upper() + str(text)[1:]
-
-
-def _unit(variable: xr.DataArray) -> str:
-    units = units_of(variable)
-    return "" if units in ("1", "") else f" {units}"
 
 
 def _share(share: float) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from drivetrain_jax._errors import InputError
+from drivetrain_jax._units import behind
 from drivetrain_jax.analysis import OUTCOME, get_analysis
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
 from drivetrain_jax.atlas import design, proof
@@ -167,7 +168,7 @@ class AtlasQuery:
         aside = [f"{name} = {number(value, known)}"] if label != name and not self.show else []
         aside += [f"error at most {known:.1e}"] if known else []
         bound = known * abs(quantity / value) if value else 0.0
-        text = f"{label} = {number(quantity, bound)}{_unit(units)}"
+        text = f"{label} = {number(quantity, bound)}{behind(units)}"
         return f"{text} ({', '.join(aside)})" if aside else text
 
     def span(self, name: str, ends: Range) -> str:
@@ -177,7 +178,7 @@ class AtlasQuery:
         # A narrow range needs more digits than a number.
         width, largest = abs(high - low), max(abs(low), abs(high))
         digits = max(6, math.ceil(math.log10(largest / width)) + 1) if width else 6
-        return f"{label} = {number(low, most=digits)} to {number(high, most=digits)}{_unit(units)}"
+        return f"{label} = {number(low, most=digits)} to {number(high, most=digits)}{behind(units)}"
 
     def physical(self, values: Mapping[str, float | Range]) -> dict[str, Any]:
         """``values`` in the physical units of the input; empty without physical input."""
@@ -188,10 +189,6 @@ class AtlasQuery:
                 numbers = np.asarray(convert(np.asarray(value))).tolist()
                 physical[quantity.name] = {"value": numbers, "units": quantity.units}
         return physical
-
-
-def _unit(units: str) -> str:
-    return "" if units == "1" else f" {units}"
 
 
 def _plain(value: Any) -> Any:
@@ -601,7 +598,7 @@ def _side(asked: AtlasQuery, name: str, value: float, crossing: Crossing) -> str
     _, there, units = asked.shown(name, crossing.value)
     where = "below" if crossing.value <= value else "above"
     place = asked.named(name, crossing.value, crossing.error)
-    return f"{number(abs(there - here))}{_unit(units)} {where}: {place}"
+    return f"{number(abs(there - here))}{behind(units)} {where}: {place}"
 
 
 def _reach(asked: AtlasQuery, nearest: design.Nearest) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from drivetrain_jax import _programs
 from drivetrain_jax._errors import InputError, counted, did_you_mean, shown
 from drivetrain_jax._quantities import Parameter
-from drivetrain_jax._units import factor
+from drivetrain_jax._units import behind, factor
 from drivetrain_jax.analysis import OUTCOME, Request, get_analysis
 from drivetrain_jax.analysis._base import make_request
 from drivetrain_jax.analysis.atlas import ANALYSIS
@@ -65,9 +65,8 @@ def check_same(name: str, value: Any, fixed: float, source: str = "", units: str
     ``source`` names the physical data from which it follows.
     """
     if isinstance(value, tuple) or not np.allclose(value, fixed, rtol=SAME_FIXED, atol=0):
-        unit = "" if units == "1" else f" {units}"
-        written = f"{name} = {as_given(value)}{unit}" + (f" (from {source})" if source else "")
-        raise InputError(f"{written}: the atlas is made for {name} = {fixed:.6g}{unit}; expected that value")
+        written = f"{name} = {as_given(value)}{behind(units)}" + (f" (from {source})" if source else "")
+        raise InputError(f"{written}: the atlas is made for {name} = {fixed:.6g}{behind(units)}; expected that value")
 
 
 def as_given(value: Any) -> str:
@@ -325,7 +324,7 @@ class StoredAtlas:
 
     def __repr__(self) -> str:
         ends = [self.viewed_as(name, *ends) for name, ends in self.ranges.items()]
-        ranges = ", ".join(f"{q.name} {a:g} to {b:g}{'' if q.units == '1' else f' {q.units}'}" for q, a, b in ends)
+        ranges = ", ".join(f"{q.name} {a:g} to {b:g}{behind(q.units)}" for q, a, b in ends)
         atlas = self.stability.atlas
         fixed = ", ".join(f"{name} = {value:g}" for name, value in self.fixed.items())
         parts = f"{counted(len(atlas.panels), 'panel', 'panels')}, {counted(len(atlas.gaps), 'gap', 'gaps')}"

@@ -134,7 +134,7 @@ class PointResult(NamedResults):
     def _lines(self) -> list[str]:
         # An empty list is the default "none".
         parameters = ", ".join(
-            _with_units(f"{n} = {written(v, _PROSE)}", self.parameter_units[n])
+            f"{n} = {written(v, _PROSE)}{_units.behind(self.parameter_units[n])}"
             for n, v in self.parameters.items()
             if v != ()
         )
@@ -142,14 +142,14 @@ class PointResult(NamedResults):
         matrices = [n for n, v in self.values.items() if np.ndim(v) == 2]
         plain = [name for name in self.values if name not in (*listed, *matrices)]
         width = max(map(len, (*plain, "outcome")))
-        data = (_with_units(f"{n} = {written(v, _PROSE)}", units) for n, (v, units) in self.physical.items())
+        data = (f"{n} = {written(v, _PROSE)}{_units.behind(units)}" for n, (v, units) in self.physical.items())
         lines = [f"{self.system} {self.analysis} (method {self.method}), {', '.join(data) or parameters}"]
         lines += [f"  that is {parameters}"] if self.physical else []
         for name in plain:
             text = _text(self.variables[name], self.values[name])
             near = self.advice and self.outcome.has_value and text.startswith("undecided ")
             hint = f" ({self.advice})" if near else ""
-            lines.append(f"  {name:{width}} = {_with_units(text, self.variables[name].units)}{hint}")
+            lines.append(f"  {name:{width}} = {text}{_units.behind(self.variables[name].units)}{hint}")
         lines += growth_lines(self.growth, width)
         hint = f" ({self.remedy})" if self.remedy and self.outcome == Outcome.NOT_CONVERGED else ""
         lines.append(f"  {'outcome':{width}} = {self.outcome.name.lower()}{hint}")
@@ -170,7 +170,7 @@ class PointResult(NamedResults):
         head = [rows, *(f"{columns} {written(label)}" for label in self.labels[columns])]
         named = zip(self.labels[rows], values, strict=True)
         cells = [[written(label), *(_text(variable, value) for value in row)] for label, row in named]
-        return [f"  {_with_units(name, variable.units)}", *aligned([head, *cells])]
+        return [f"  {name}{_units.behind(variable.units)}", *aligned([head, *cells])]
 
     def _table(self, dim: str, names: Sequence[str]) -> list[str]:
         columns = [[dim, *map(str, self.labels[dim])]]
@@ -184,10 +184,6 @@ class PointResult(NamedResults):
 def _meaning(flags: Sequence[str], value: Any) -> Any:
     """The words of codes, in the shape of ``value``."""
     return [_meaning(flags, code) for code in value] if np.ndim(value) else flags[int(value)]
-
-
-def _with_units(text: str, units: str) -> str:
-    return text if units == "1" else f"{text} {units}"
 
 
 def _text(variable: Variable, value: Any) -> str:

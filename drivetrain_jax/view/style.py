@@ -169,7 +169,7 @@ def value_text(name: str, value: object, units: str = "1") -> str:
     if len(entries) > _MOST_ENTRIES:
         return f"{symbol(name)}: {len(entries)} values"
     factor, units = prefixed([entry for entry in entries if isinstance(entry, (int, float))], units)
-    end = f" {written_units(units)}" if units not in ("1", "") else ""
+    end = _units.behind(written_units(units))
     digits = "{:.5g}" if entries is value else "{:.6g}"
     texts = (power_of_ten(digits.format(x / factor)) if isinstance(x, (int, float)) else str(x) for x in entries)
     text = ", ".join(texts)
@@ -207,8 +207,7 @@ def runs_text(axis: xr.DataArray, runs: Sequence[Any] | np.ndarray, names: Seque
     shown = [f"{a:.6g}" if a == b else f"{a:.6g} to {b:.6g}" for a, b in runs[:MOST_RANGES]]
     shown = [f"{text} ({name})" if name else text for text, name in zip_longest(shown, names[: len(shown)])]
     more = f" and {len(runs) - MOST_RANGES} more ranges" if len(runs) > MOST_RANGES else ""
-    units = units_of(axis)
-    return f"{scene_key(axis)} = {', '.join(shown)}{more}{'' if units in ('1', '') else f' {units}'}"
+    return f"{scene_key(axis)} = {', '.join(shown)}{more}{_units.behind(units_of(axis))}"
 
 
 def unstable_text(dataset: xr.Dataset, along: str) -> str:
