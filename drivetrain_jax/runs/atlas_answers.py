@@ -63,13 +63,12 @@ def number(value: float, error: float = 0.0, most: int = 6) -> str:
     return f"{value:.{min(max(int(known), 1), most)}g}"
 
 
-def roles_of(atlas: StoredAtlas, *roles: str) -> list[str]:
-    """The parameters with these ``roles`` in the system; :class:`InputError` if it has none."""
+def role_of(atlas: StoredAtlas, role: str) -> str:
+    """The parameter with this ``role`` in the system; :class:`InputError` if it has none."""
     system = atlas.scene.system
-    for role in roles:
-        if role not in system.roles:
-            raise InputError(f"file: {system.name} names no {role}; expected a system that does")
-    return [system.roles[role] for role in roles]
+    if role not in system.roles:
+        raise InputError(f"file: {system.name} names no {role}; expected a system that does")
+    return system.roles[role]
 
 
 @dataclass(frozen=True)
@@ -330,9 +329,9 @@ def _limit(
     vary: str,
 ) -> tuple[AtlasQuery, design.Answer]:
     """The limit of the parameter with this ``role``, or of ``vary``, within which a range of speeds is stable."""
-    (speed,) = roles_of(atlas, "speed")
+    speed = role_of(atlas, "speed")
     shown = {quantity.name: name for name, (quantity, _) in atlas.viewed(given, (vary,)).views.items()}
-    limited = shown.get(vary, vary) or roles_of(atlas, role)[0]
+    limited = shown.get(vary, vary) or role_of(atlas, role)
     if limited == speed:
         raise InputError(f"vary = {vary!r}: is the speed; expected another parameter of the atlas")
     asked = replace(AtlasQuery.of(atlas, given, ranges=(speed,), free=(limited,)), show=show)
@@ -348,7 +347,7 @@ def speed_windows(
     if not 0 <= margin < 1:
         meant = f"; did you mean {margin:g} %?" if 1 <= margin < 100 else ""
         raise InputError(f"margin = {margin!r}: expected 0 <= margin < 1{meant}")
-    (speed,) = roles_of(atlas, "speed")
+    speed = role_of(atlas, "speed")
     asked = replace(AtlasQuery.of(atlas, given, ranges=(), free=(speed,), within=(speed,)), show=show)
     panels = atlas.stability.atlas
     part = narrow(panels, {speed: asked.values[speed]}) if speed in asked.values else panels
