@@ -73,7 +73,6 @@ class PointResult(NamedResults):
     forced: tuple[str, Mapping[str, Any]] | None = field(default=None, repr=False)
     sensitivities: Sequence[Any] | None = field(default=None, repr=False)
     unstable: tuple[str, Sequence[Any]] | None = field(default=None, repr=False)
-    _effects: Sequence[str] = field(default=(), repr=False)
 
     @property
     def crossings(self) -> dict[str, np.ndarray]:
@@ -159,7 +158,10 @@ class PointResult(NamedResults):
             lines += self._matrix(name)
         lines += self.orders.lines() if self.orders else []
         lines += [f"  forced amplitude: {self.forced[0]}"] if self.forced else []
-        return lines + [f"  {line}" for line in self._effects]
+        if self.sensitivities is not None:
+            results = differentiable(self.variables[name] for name in self.values)
+            lines += [f"  {line}" for line in effect_lines(self.sensitivities, results, self.labels)]
+        return lines
 
     def _matrix(self, name: str) -> list[str]:
         """A result with two dimensions as text, the longer one downwards."""
@@ -244,8 +246,8 @@ def point(
         if analysed.derivatives is None:
             known = (name for name in analyses_of(job.scene.system) if get_analysis(name).derivatives)
             raise InputError(f"sensitivities: {analysis} has no derivatives; expected {' or '.join(known) or 'none'}")
-        if not differentiable(analysed, asked):
-            names = ", ".join(v.name for v in differentiable(analysed, [v.name for v in analysed.variables]))
+        if not differentiable(map(analysed.variable, asked)):
+            names = ", ".join(v.name for v in differentiable(analysed.variables))
             raise InputError(f"outputs = {list(asked)}: without sensitivities; expected one of {names}")
         tree["outputs"] = [*dict.fromkeys((*asked, *analysed.derivative_outputs(asked)))]
         job = resolve(load_scene(tree))
@@ -266,10 +268,8 @@ def _with_sensitivities(result: PointResult, request: Request, scene: Scene, giv
         }
         asked = replace(scene, request=request)
         effects = point_sensitivities(asked, given, data, result.parameters, result.values)
-    shown = differentiable(scene.analysis, request.outputs)
-    lines = effect_lines(effects, shown, result.labels)
     values = {name: x for name, x in result.values.items() if name in request.outputs}
-    return replace(result, values=values, sensitivities=effects, _effects=lines)
+    return replace(result, values=values, sensitivities=effects)
 
 
 def _with_entries(given: Mapping[str, Any]) -> dict[str, Any]:

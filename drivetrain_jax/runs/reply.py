@@ -23,7 +23,6 @@ from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError, aligned, shown
 from drivetrain_jax._quantities import Parameter, Variable
 from drivetrain_jax.analyses import jacobians
-from drivetrain_jax.analysis import Analysis
 from drivetrain_jax.analysis._base import checked
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
 from drivetrain_jax.runs.axes import placed
@@ -174,14 +173,10 @@ def radius_sensitivities(asked: AtlasQuery, slopes: Mapping[str, float] | None) 
     return _of_data(asked.atlas.scene.system, asked.shaft, point, "", change)
 
 
-def differentiable(analysis: Analysis, outputs: Iterable[str]) -> list[Variable]:
-    """The results among ``outputs`` that may have derivatives and a table: numbers with at most one dimension."""
-    known = [analysis.variable(name) for name in outputs]
-    return [
-        v
-        for v in known
-        if v.dtype == "float64" and len(v.dims) < 2 and not v.name.endswith(("_error", "_residual", "_margin"))
-    ]
+def differentiable(results: Iterable[Variable]) -> list[Variable]:
+    """Those of ``results`` that may have derivatives and a table: numbers with at most one dimension."""
+    numbers = [v for v in results if v.dtype == "float64" and len(v.dims) < 2]
+    return [v for v in numbers if not v.name.endswith(("_error", "_residual", "_margin"))]
 
 
 def point_sensitivities(
@@ -193,7 +188,8 @@ def point_sensitivities(
 ) -> list[Sensitivity]:
     """Sensitivities of the results ``values`` of a point, by result, largest effect first: by the ``given`` names and by
     parameters that do not follow from them. ``physical`` are the data in their units; numbers of 0 have none."""
-    system, names = scene.system, [v.name for v in differentiable(scene.analysis, scene.request.outputs)]
+    system, asked = scene.system, map(scene.analysis.variable, scene.request.outputs)
+    names = [v.name for v in differentiable(asked)]
     # An empty list is the default of an option, and no value of it.
     options = {n: x for n, x in scene.request.options.items() if x != ()} | {"method": scene.request.method}
     keys, found = jacobians(scene.analysis.name, system.of(parameters), names, options, values, hold=True)
