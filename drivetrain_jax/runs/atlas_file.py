@@ -435,7 +435,7 @@ class StoredAtlas:
 
     def scene_on(self, columns: Mapping[str, np.ndarray], *, zipped: bool = False) -> Scene:
         """The ``floquet`` scene with the results of :meth:`arrays`."""
-        return self._scene(columns, self.fixed, self.request, zipped)
+        return self._scene(columns, "floquet", self.request, zipped)
 
     @property
     def request(self) -> Request:
@@ -467,8 +467,7 @@ class StoredAtlas:
 
     def _solved(self, columns: Mapping[str, np.ndarray], analysis: str, request: Request) -> np.ndarray:
         axes = {name: column for name, column in columns.items() if name in self.parameters}
-        scene = self._scene(axes, dict(self.fixed), request, zipped=True)
-        job = Job(replace(scene, analysis=get_analysis(analysis).for_system(scene.system)), DIRECT)
+        job = Job(self._scene(axes, analysis, request, zipped=True), DIRECT)
         buffer = ResultBuffer(job.scene, job.grid)
         Work(Threads()).do(job, buffer.fill, Progress(job.total))
         return buffer.lay_out()[request.outputs[0]]
@@ -509,12 +508,11 @@ class StoredAtlas:
         quantities = (Axis(shown.name, shown, None, quantity),) if name in self.views else ()
         return Axis(name, self.scene.system.parameter(name), None, values, quantities)
 
-    def _scene(self, axes: Mapping[str, np.ndarray], fixed: Mapping[str, Any], request: Request, zipped: bool) -> Scene:
-        scene, system = self.scene, self.scene.system
+    def _scene(self, axes: Mapping[str, np.ndarray], name: str, request: Request, zipped: bool) -> Scene:
+        scene, analysis = self.scene, get_analysis(name).for_system(self.scene.system)
         columns = tuple(self._axis(name, np.asarray(v, float)) for name, v in axes.items())
-        fixed = dict(scene.fixed) | {name: value for name, value in fixed.items() if name not in axes}
-        floquet = get_analysis("floquet").for_system(system)
-        return Scene(system, floquet, request, columns, zipped, fixed, scene.title, scene.text, scene.data)
+        fixed = {**scene.fixed, **self.fixed}
+        return Scene(scene.system, analysis, request, columns, zipped, fixed, scene.title, scene.text, scene.data)
 
 
 def _scaled(convert: Callable[[Any], Any], size: float, values: Any) -> Any:
