@@ -300,7 +300,7 @@ def stored_orders(attrs: Mapping[str, Any]) -> Orders | None:
     if options.get("order"):
         return None
     known = json.loads(attrs.get("physical_data", "{}")) | json.loads(attrs.get("fixed_parameters", "{}"))
-    values = {n: e["value"] for n, e in known.items() if isinstance(e, dict)}
+    values = {n: e["value"] for n, e in known.items()}
     return orders_of(str(attrs.get("system")), values, options.get("orders", ()))
 
 

@@ -119,8 +119,7 @@ def scene_key(coordinate: xr.DataArray) -> str:
 def parameters(dataset: xr.Dataset) -> dict[str, Any]:
     """The parameters that do not vary, in their stored units: fixed ones, and axes of one value."""
     fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}"))
-    fixed = {name: entry if isinstance(entry, dict) else {"value": entry} for name, entry in fixed.items()}
-    values = {name: _with_infinity(entry.get("value")) for name, entry in fixed.items()}
+    values = {name: _with_infinity(entry["value"]) for name, entry in fixed.items()}
     for coordinate in dataset.coords.values():
         name, _, place = scene_key(coordinate).rstrip("]").partition("[")
         if coordinate.ndim or coordinate.dtype.kind != "f":
@@ -253,10 +252,9 @@ def _given(dataset: xr.Dataset) -> dict[str, set[str]]:
     return {table: set(scene_of(dataset).get(table, ())) for table in ("fixed", "axes", "points")}
 
 
-def _fixed_text(dataset: xr.Dataset, name: str, entry: Any) -> str:
+def _fixed_text(dataset: xr.Dataset, name: str, entry: Mapping[str, Any]) -> str:
     """A fixed value in the unit asked for or given; swept entries of a list, such as ``planet_angle[1]``, vary."""
-    entry = entry if isinstance(entry, dict) else {"value": entry}
-    value, stored = entry.get("value"), str(entry.get("units", "1"))
+    value, stored = entry["value"], str(entry.get("units", "1"))
     size, units = unit_of(dataset, name, stored)
     if not isinstance(value, (list, tuple)):
         return value_text(name, value * size if isinstance(value, (int, float)) else value, units)
@@ -330,7 +328,7 @@ def in_units(dataset: xr.Dataset, asked: Sequence[str] = ()) -> xr.Dataset:
         if unit != units and variable.dtype.kind in "fc":
             attrs = {**variable.attrs, "units": unit, CONVERTED: 1}
             changed[name] = variable.dims, variable.values * factor, attrs
-    components, sizes = json.loads(dataset.attrs.get("state", "[]")), []
+    components, sizes = state(dataset), []
     for component in components:
         factor, component["units"] = suitable(component["units"], asked)
         component["scale"] = component.get("scale", 1.0) * factor / (sizes or [factor])[0]
@@ -370,9 +368,8 @@ def value_in(variable: xr.DataArray, units: str) -> Any:
 
 def check_measured(dataset: xr.Dataset, asked: Iterable[str]) -> None:
     """Raise :class:`InputError` for a unit ``asked`` for that measures no parameter and no result of ``dataset``."""
-    components = json.loads(dataset.attrs.get("state", "[]"))
     fixed = json.loads(dataset.attrs.get("fixed_parameters", "{}")).values()
-    described = [v.attrs for v in dataset.variables.values()] + components + [x for x in fixed if isinstance(x, dict)]
+    described = [*(v.attrs for v in dataset.variables.values()), *state(dataset), *fixed]
     units = dict.fromkeys(str(about.get("units", "1")) for about in described)
     remedy = " (a dimensionless speed needs physical data in the scene)"
     for unit in asked:

@@ -11,7 +11,7 @@ from matplotlib.text import Text
 
 LONG_NAMES = {"beta": "joint angle", "Omega": "speed", "mu": "stiffness ratio", "alpha": "damping ratio"}
 UNITS = {"beta": "rad"}
-FIXED = {"zeta": 0.001, "gamma": 100.0}
+FIXED = {"zeta": {"value": 0.001, "units": "1"}, "gamma": {"value": 100.0, "units": "1"}}
 ROLES = json.dumps({"speed": "Omega"})
 FAMILIES = {
     "H": {"name": "harmonic $H$", "line": "solid", "forced": True},

@@ -34,7 +34,7 @@ def history(**axes: list[float]) -> xr.Dataset:
         {"name": "phi", "units": "rad", "long_name": "twist", "symbol": ""},
         {"name": "velocity", "units": "rad/s", "long_name": "rate of twist", "symbol": "$v$"},
     ]
-    fixed = json.dumps({"beta": 0.1})
+    fixed = json.dumps({"beta": {"value": 0.1, "units": "1"}})
     attrs = {"analysis": "history", "title": "A twist", "fixed_parameters": fixed, "state": json.dumps(state)}
     return xr.Dataset(data, coords, attrs)
 
