@@ -241,34 +241,34 @@ def point(
         # Messages name the fields without the tables of a scene.
         text = re.sub(r"^(points|fixed|options)\.", "", str(error))
         raise InputError(re.sub(r"^(\w+)\.values = \[(.*?)\]:", r"\1 = \2:", text)) from None
+    scene = job.scene
     if sensitivities:
-        analysed, asked = job.scene.analysis, job.scene.request.outputs
+        analysed, asked = scene.analysis, scene.request.outputs
         if analysed.derivatives is None:
-            known = (name for name in analyses_of(job.scene.system) if get_analysis(name).derivatives)
+            known = (name for name in analyses_of(scene.system) if get_analysis(name).derivatives)
             raise InputError(f"sensitivities: {analysis} has no derivatives; expected {' or '.join(known) or 'none'}")
         if not differentiable(map(analysed.variable, asked)):
             names = ", ".join(v.name for v in differentiable(analysed.variables))
             raise InputError(f"outputs = {list(asked)}: without sensitivities; expected one of {names}")
         tree["outputs"] = [*dict.fromkeys((*asked, *analysed.derivative_outputs(asked)))]
         job = resolve(load_scene(tree))
-    limit = None if amplitude is None else Limit.from_text(job.scene.system, amplitude)
+    limit = None if amplitude is None else Limit.from_text(scene.system, amplitude)
     result = _result(job)
     if sensitivities:
-        result = _with_sensitivities(result, replace(job.scene.request, outputs=asked), job.scene, given)
+        result = _with_sensitivities(result, scene, given)
     return result if limit is None else replace(result, forced=_forced(result, given, limit))
 
 
-def _with_sensitivities(result: PointResult, request: Request, scene: Scene, given: Iterable[str]) -> PointResult:
-    """The ``result`` with the sensitivities of the requested results, which its other values served."""
+def _with_sensitivities(result: PointResult, scene: Scene, given: Iterable[str]) -> PointResult:
+    """The ``result`` with the sensitivities of the results that ``scene`` requests, which its other values served."""
     effects, known = [], described(scene.system)
     if result.outcome.has_value:
         data = {
             n: x if isinstance(x, str) or units == known[n].units else x * _units.factor(units, known[n].units)
             for n, (x, units) in result.physical.items()
         }
-        asked = replace(scene, request=request)
-        effects = point_sensitivities(asked, given, data, result.parameters, result.values)
-    values = {name: x for name, x in result.values.items() if name in request.outputs}
+        effects = point_sensitivities(scene, given, data, result.parameters, result.values)
+    values = {name: x for name, x in result.values.items() if name in scene.request.outputs}
     return replace(result, values=values, sensitivities=effects)
 
 
