@@ -21,7 +21,7 @@ import numpy as np
 
 from drivetrain_jax import _units
 from drivetrain_jax._errors import InputError, aligned, shown
-from drivetrain_jax._quantities import Parameter, Variable
+from drivetrain_jax._quantities import Dimension, Parameter, Variable
 from drivetrain_jax.analyses import jacobians
 from drivetrain_jax.analysis._base import checked
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
@@ -367,11 +367,11 @@ _NEAR = 0.01
 
 @dataclass(frozen=True)
 class Limit:
-    """A largest allowed amplitude in the unit of the displacements, and the unit of its answers."""
+    """A largest allowed amplitude in the unit ``own`` of the ``displacements``, and the unit of its answers."""
 
     value: float
     units: str
-    names: tuple[str, ...]
+    displacements: Dimension
     own: str
 
     @classmethod
@@ -388,8 +388,7 @@ class Limit:
         if parts and not parts[1]:
             written = parts[0]
         value = float(checked(parameter, written, ""))
-        names = tuple(map(str, system.displacements.values))
-        return cls(value, parts[1] if parts and parts[1] else units, names, units)
+        return cls(value, parts[1] if parts and parts[1] else units, system.displacements, units)
 
     def written(self, amplitude: float) -> str:
         """An amplitude as text, in the unit of the limit."""
@@ -403,7 +402,7 @@ class Limit:
         known, unstable, undecided = bool(np.all(np.isfinite(amplitudes))), verdict == 1, verdict == 2
         above = known and bool(np.max(amplitudes) > self.value)
         within = None if not known or (undecided and not above) else not (above or unstable)
-        names = self.names or tuple(map(str, range(1, len(amplitudes) + 1)))
+        names = [str(label) for label in self.displacements.labels(len(amplitudes))]
         listed = ", ".join(f"{name} {self.written(a)}" for name, a in zip(names, amplitudes, strict=True))
         compared = "unstable: the motion grows beyond" if unstable else "above" if above else "within"
         doubt = " if the motion is stable, which is undecided" if within is None else ""
@@ -428,8 +427,8 @@ class Limit:
         x, y = _sampled(amplitude, low, high, likely, self.value, _LIMIT_ROUNDS)
         size = np.max(y, axis=1)
         k = int(np.argmax(size))
-        largest, where, name = float(size[k]), float(x[k]), self.names[int(np.argmax(y[k]))]
-        within = runs(x, size <= self.value)
+        largest, where, within = float(size[k]), float(x[k]), runs(x, size <= self.value)
+        name = str(self.displacements.labels(y.shape[1])[int(np.argmax(y[k]))])
         text, limit = f"at most {self.written(largest)} ({name} at {named(where)})", self.written(self.value)
         if largest <= self.value:
             text += f": within the limit of {limit}"

@@ -54,6 +54,12 @@ def test_a_curve_below_the_limit_is_within_it():
     assert TWO.along(lambda r: np.full((r.size, 2), 1.0), 1.0, 2.0, np.empty(0), str)[1]["within"] == []
 
 
+def test_displacements_without_names_have_numbers():
+    limit = Limit.from_text(dt.Driveline, "2 deg")
+    assert limit.along(lambda r: r[:, None] * [0.1, 0.2], 1.0, 2.0, np.empty(0), str)[1]["displacement"] == "2"
+    assert list(limit.at_point(np.array([0.1, 0.2]), 0)[1]["amplitude"]) == ["1", "2"]
+
+
 @pytest.mark.full
 @pytest.mark.parametrize(("limit", "within"), [("2 deg", True), ("1.5 deg", False), (0.03, True)])
 def test_a_point_compares_its_forced_motion_with_a_limit(limit, within):
