@@ -39,7 +39,7 @@ from drivetrain_jax.runs.resolve import resolve
 from drivetrain_jax.runs.scene import Scene, load_scene
 from drivetrain_jax.systems import get_system
 from drivetrain_jax.systems._base import RPM
-from drivetrain_jax.view.style import in_units, ranges_text, runs_text, units_of, unstable_text
+from drivetrain_jax.view.style import entry_name, in_units, ranges_text, runs_text, units_of, unstable_text
 
 
 @dataclass(frozen=True)
@@ -425,8 +425,7 @@ def _forced_sentence(
             if name in values and np.isfinite(values[name]).all():
                 (dim,), units, k = variables[name].dims, variables[name].units, int(np.argmax(values[name]))
                 size = f"{np.degrees(values[name][k]):.4g} deg" if units == "rad" else f"{values[name][k]:.4g} {units}"
-                label = str(labels[dim][k])
-                reached.append(f"{size} ({f'{dim} {label}' if label[0].isdigit() else f'{label} {dim}'})")
+                reached.append(f"{size} ({entry_name(dim, labels[dim][k])})")
         sentences += [f"{motion} reaches {' and '.join(reached)}."] if reached else []
     return " ".join(sentences)
 

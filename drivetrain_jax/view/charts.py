@@ -35,6 +35,7 @@ from drivetrain_jax.view.style import (
     PREDICTION,
     axis_label,
     coordinate_text,
+    entry_name,
     in_brackets,
     power_of_ten,
     ranges_text,
@@ -547,13 +548,6 @@ def _title(part: xr.Dataset, names: Sequence[str]) -> str:
         return coordinate_text(c) if c.dtype.kind == "f" else entry_name(str(c.name).replace("_", " "), c.item())
 
     return ", ".join(text(part[name]) for name in names if name in part.coords and not part[name].ndim)
-
-
-def entry_name(dimension: str, entry: object) -> str:
-    """``driving shaft`` for a named entry of a dimension, ``shaft 1`` for a numbered one, ``carrier`` for a body."""
-    if dimension == "body":
-        return str(entry)
-    return f"{dimension} {entry}" if str(entry)[:1].isdigit() else f"{entry} {dimension}"
 
 
 def _draw_threshold(axes: Axes, dataset: xr.Dataset, horizontal: str, vertical: str) -> list[Line2D]:

@@ -23,6 +23,7 @@ from drivetrain_jax.view.style import (
     FRAME_GREY,
     LINE_COLOURS,
     axis_label,
+    entry_name,
     in_brackets,
     parameters,
     size,
@@ -279,7 +280,7 @@ def _orbits(dataset: xr.Dataset, path: str) -> Figure:
         for kind, label, face in ((_STABLE, "stable", colour), (_UNSTABLE, "unstable", "none")):
             place, branch = np.nonzero(stability == kind)
             style = {"color": colour, "markerfacecolor": face, "markersize": 2.4, "markeredgewidth": 0.7}
-            label = f"{label}, {charts.entry_name(displaced, name)}"
+            label = f"{label}, {entry_name(displaced, name)}"
             sheet.add(*(axes.plot(x[place], values[place, branch], "o", **style, label=label) if place.size else ()))
         _draw_bifurcations(sheet, axes, dataset, path)
         axes.set_ylim(bottom=0.0)

@@ -188,6 +188,13 @@ def coordinate_text(coordinate: xr.DataArray) -> str:
     return value_text(scene_key(coordinate), coordinate.item(), coordinate.attrs.get("units", "1"))
 
 
+def entry_name(dimension: str, entry: object) -> str:
+    """``driving shaft`` for a named entry of a dimension, ``shaft 1`` for a numbered one, ``carrier`` for a body."""
+    if dimension == "body":
+        return str(entry)
+    return f"{dimension} {entry}" if str(entry)[:1].isdigit() else f"{entry} {dimension}"
+
+
 def ranges_text(axis: xr.DataArray, holds: np.ndarray) -> str:
     """The runs of sampled values of ``axis`` at which ``holds`` is true: ``speed = 1425, 2275 to 2290 rpm``."""
     # An axis keeps the order of its scene, in which neighbours of a list may lie far apart.
