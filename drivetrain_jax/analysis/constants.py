@@ -50,8 +50,8 @@ def _solve(
     return results | {"outcome": outcome.astype(jnp.int8)}
 
 
-def _solvers(name: str, system: type[System], request: Request) -> tuple[Solver, ...]:
-    return (Solver("closed form", partial(_solve, name, system, request), seconds=1e-7, chunk=4096),)
+def _solvers(name: str, cost: Mapping[str, Any], system: type[System], request: Request) -> tuple[Solver, ...]:
+    return (Solver("closed form", partial(_solve, name, system, request), **cost),)
 
 
 def _dimensions(name: str, system: type[System], request: Request, fixed: Mapping[str, Any]) -> tuple[Dimension, ...]:
@@ -75,9 +75,9 @@ def _of_system(name: str, system: type[System]) -> dict[str, Any]:
     }
 
 
-def constants(name: str, title: str) -> Analysis:
-    """The analysis ``name``, whose results are the constants that a system declares for it."""
-    solvers = partial(_solvers, name)
+def constants(name: str, title: str, **cost: Any) -> Analysis:
+    """The analysis ``name``, whose results are the constants that a system declares for it; ``cost`` as of a solver."""
+    solvers = partial(_solvers, name, cost)
     return Analysis(
         name=name,
         title=title,
@@ -93,6 +93,6 @@ def constants(name: str, title: str) -> Analysis:
     )
 
 
-PARAMETERS = constants("parameters", "constants of the system")
-# Uneven rotation of a rigid driveline, and the phases of its yokes that minimise it.
-PHASING = constants("phasing", "phases of the yokes")
+PARAMETERS = constants("parameters", "constants of the system", seconds=1e-7, chunk=4096)
+# Uneven rotation of a rigid driveline, and the phases of its yokes that minimise it; behind gears it is sampled.
+PHASING = constants("phasing", "phases of the yokes", seconds=1e-3, chunk=128)

@@ -230,32 +230,37 @@ def check(fixed: Values) -> None:
 # The uneven rotation of the rigid chain, and phases that remove it.
 
 
-# Samples of a period, those of their extremes that are refined, and hyperbolic length below which joints cancel.
-_SAMPLES, _EXTREMES, _CANCELLED = 4096, 16, 1e-9
+# Samples of a period, its parts whose highest peaks are refined, and hyperbolic length below which joints cancel.
+_SAMPLES, _PARTS, _CANCELLED = 4096, 128, 1e-9
 # Distances within rounding of extremes, and of their derivatives.
 _LEVEL, _ALIKE = 1e-12, 1e-9
 
 
 def range_of(function: Callable[[Any], Any], period: Any) -> Any:
     """Largest minus smallest value of a smooth function of that ``period``, ``(...)``, by samples and Newton's method."""
-    step = jnp.asarray(period, float) / _SAMPLES
-    times = step * jnp.arange(_SAMPLES).reshape(-1, *(1,) * step.ndim)
+    step, size = jnp.asarray(period, float) / _SAMPLES, _SAMPLES // _PARTS
+    sign = jnp.array([1.0, -1.0]).reshape(-1, *(1,) * step.ndim)
     slope = lambda t: jax.jvp(function, (t,), (jnp.ones_like(t),))[1]  # noqa: E731
-    values = function(times)
 
-    def largest(sign: float) -> Array:
-        # The sample next to a lower peak may lie above that next to the highest one.
-        heights = sign * values
-        lower = (heights < jnp.roll(heights, 1, axis=0)) | (heights < jnp.roll(heights, -1, axis=0))
-        tops, places = jax.lax.top_k(jnp.moveaxis(jnp.where(lower, -jnp.inf, heights), 0, -1), _EXTREMES)
-        t = start = step * jnp.moveaxis(places, -1, 0)
-        for _ in range(4):
-            first, second = jax.jvp(slope, (t,), (jnp.ones_like(t),))
-            moved = t - first / jnp.where(second == 0, jnp.inf, second)
-            t = jnp.clip(moved, start - step, start + step)
-        return _largest(jnp.where(jnp.moveaxis(tops, -1, 0) == -jnp.inf, -jnp.inf, sign * function(t)))
+    def highest(part: Array) -> tuple[Array, Array]:
+        """Of the function and of its negative, the highest peak among the samples of a part, -inf without one, and where."""
+        number = (part * size + jnp.arange(-1, size + 1)).reshape(-1, *(1,) * step.ndim)
+        # XLA would compute them again for each of their uses.
+        values = jax.lax.optimization_barrier(jax.lax.stop_gradient(function(step * number)))
+        heights = sign * values[:, None]
+        lower = (heights[1:-1] < heights[:-2]) | (heights[1:-1] < heights[2:])
+        peaks = jnp.where(lower, -jnp.inf, heights[1:-1])
+        return jnp.max(peaks, axis=0), step * (part * size + jnp.argmax(peaks, axis=0))
 
-    return jnp.maximum(largest(1.0) + largest(-1.0), 0.0)
+    def nearer(_: int, t: Array) -> Array:
+        first, second = jax.jvp(slope, (t,), (jnp.ones_like(t),))
+        moved = t - first / jnp.where(second == 0, jnp.inf, second)
+        return jnp.clip(moved, start - step, start + step)
+
+    # The sample next to a lower peak may lie above that next to the highest one.
+    tops, start = jax.lax.map(highest, jnp.arange(_PARTS))
+    extremes = sign * function(jax.lax.fori_loop(0, 4, nearer, start))
+    return jnp.maximum(jnp.sum(_largest(jnp.where(tops == -jnp.inf, -jnp.inf, extremes)), axis=0), 0.0)
 
 
 @jax.custom_jvp
@@ -339,18 +344,18 @@ def uneven_rotation(beta: Components, phase: Components, ratio: Components, half
         return 4 * rho / (1 - rho**2), 2 * jnp.arcsin(rho) * abs(math.prod(ratio[last:]))
     mean = math.prod(ratio)
 
-    def lead(tau: Any) -> Any:
-        angle = tau
+    def turned(tau: Any) -> tuple[Any, Any]:
+        """The rotation of the output over the mean ratio, and its derivative."""
+        angle, speed = tau, 1.0
         for b, p, r in zip(beta, phase, ratio, strict=True):
+            rho = jnp.tan(b / 2) ** 2
+            speed *= (1 - rho**2) / (1 + 2 * rho * jnp.cos(2 * (angle + p)) + rho**2)
             angle = r * behind(b, p, angle)
-        return angle / mean - tau
-
-    def speed(tau: Any) -> Any:
-        return jax.jvp(lead, (tau,), (jnp.ones_like(tau),))[1]
+        return angle / mean, speed
 
     shape = jnp.broadcast_shapes(*map(jnp.shape, (*beta, *phase, *ratio)))
     period = jnp.broadcast_to(math.pi * jnp.asarray(half_turns), shape)
-    return range_of(speed, period), range_of(lead, period) * abs(mean)
+    return range_of(lambda t: turned(t)[1], period), range_of(lambda t: turned(t)[0] - t, period) * abs(mean)
 
 
 PHASING = (
