@@ -192,12 +192,13 @@ def _advanced(front: _Front, ended: Array, scale: Array, longest: float, closed:
 
     A point that is not near the tangent may lie on another part of the branch, or on another branch.
     """
-    there, first = front.trial, front.number == 0
+    there, first, change = front.trial, front.number == 0, front.change
     aside = jnp.sqrt(jnp.sum(((there.x - front.guess) / scale) ** 2, axis=0))
     near = (aside <= _ASIDE * front.length) & (there.x[-1] > 0)
     near &= jnp.sum(there.tangent * front.solved.tangent, axis=0) > _LEAST_COSINE
     if special:
         near &= (front.length <= _FINE * longest) | _straight(front)
+        change = jnp.where(first, 0.0, (_tests(there.matrix) - _tests(front.solved.matrix)) / front.length)
     moved = ended & (there.change <= closed) & (near | first)
     # The parameter of the first orbit is known.
     there = there._replace(x=there.x.at[-1].set(jnp.where(first, front.guess[-1], there.x[-1])))
@@ -205,9 +206,6 @@ def _advanced(front: _Front, ended: Array, scale: Array, longest: float, closed:
     shorter = jnp.where(first, 0.0, _SHORTER * front.length)
     solved = jax.tree.map(lambda new, old: jnp.where(moved, new, old), there, front.solved)
     length = jnp.where(ended, jnp.where(moved, longer, shorter), front.length)
-    change = (
-        jnp.where(first, 0.0, (_tests(there.matrix) - _tests(front.solved.matrix)) / front.length) if special else 0.0
-    )
     guess = jnp.where(ended, solved.x + length * solved.tangent * scale, front.guess)
     return _Front(
         solved,
