@@ -51,6 +51,8 @@ class DrivetrainAccessor:
         # Local import: it takes a third of a second.
         import pandas as pd
 
+        if "outcome" not in self._dataset:
+            raise InputError("outcome: missing; expected a result on a grid")
         columns: dict[str, np.ndarray] = {}
         for name, values in _columns(self._dataset):
             if name in columns:

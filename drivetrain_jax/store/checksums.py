@@ -55,9 +55,9 @@ def unreadable(path: Path) -> InputError:
         return InputError(f"file = {str(path)!r}: a folder of unfinished work; give {str(path.with_suffix(''))!r}")
     if (path / "zarr.json").is_file():
         return InputError(f"file = {str(path)!r}: a Zarr store; use xarray.open_zarr, or `drivetrain export`")
-    what = (
-        "not a readable netCDF4/HDF5 file" if path.is_file() else "is a folder" if path.is_dir() else "does not exist"
-    )
+    # A pipe exists, and is no file.
+    exists = "is a folder" if path.is_dir() else "not a readable netCDF4/HDF5 file"
+    what = exists if path.exists() else "does not exist"
     return InputError(f"file = {str(path)!r}: {what}; give a result written by `drivetrain run`")
 
 

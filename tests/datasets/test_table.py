@@ -6,6 +6,7 @@ import os
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 
 import drivetrain_jax as dt
 from drivetrain_jax.cli import main
@@ -51,6 +52,11 @@ def test_two_results_are_never_one_column():
     chart = dt.sweep(lambda p: {"y": np.array([1, 2]) * p["x"], "y_1": p["x"]}, {"x": 0.0}, over={"x": [1.0, 2.0]})
     with pytest.raises(dt.InputError, match="table: 'y_1' names two columns"):
         chart.drivetrain.table()
+
+
+def test_a_dataset_without_outcome_has_no_table():
+    with pytest.raises(dt.InputError, match="outcome: missing; expected a result on a grid"):
+        xr.Dataset({"a": 1}).drivetrain.table()
 
 
 @pytest.mark.full

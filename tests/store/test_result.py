@@ -140,6 +140,11 @@ def test_the_message_about_a_folder_names_its_kind(tmp_path, name, file, told):
         open_result(tmp_path / name)
 
 
+def test_a_pipe_is_no_file():
+    with pytest.raises(InputError, match="not a readable"):
+        open_result(Path("/dev/null"))
+
+
 @pytest.mark.parametrize("content", [None, b"", b"no HDF5 at all", "cut"])
 def test_unreadable_result_is_one_clear_line(tmp_path, result, content):
     path = tmp_path / "r.nc"
