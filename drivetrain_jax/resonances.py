@@ -224,17 +224,19 @@ def in_hertz(values: Any, units: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Orders:
-    """Excitations by name, each with its periods ``per_turn`` of the ``shaft``; ``still``: what natural frequencies at rest
-    leave out of its critical speeds, such as the gyroscopic effect of discs."""
+    """Excitations by name, each with its periods ``per_turn`` of the ``shaft``. Natural frequencies at rest leave out the
+    gyroscopic effect of its ``discs``, and the second one of two ``planes`` of supports."""
 
     shaft: str
     per_turn: Mapping[str, float]
-    still: str = ""
+    discs: bool = False
+    planes: bool = False
 
     @property
     def frequency(self) -> str:
         """The frequencies that the orders meet, as a label."""
-        return f"natural frequency at rest, {self.still}" if self.still else "natural frequency"
+        lacking = ["without gyroscopic effect"] * self.discs + ["in the first plane"] * self.planes
+        return f"natural frequency at rest, {' and '.join(lacking)}" if lacking else "natural frequency"
 
     def speeds(self, frequency: Any) -> np.ndarray:
         """Speeds [rpm] at which the orders meet each ``frequency`` [Hz], shape ``(..., orders)``; NaN at rigid motions.
@@ -271,18 +273,13 @@ def orders_of(system: str, values: Mapping[str, Any], further: Sequence[float] =
     return replace(known, per_turn={**known.per_turn, **names})
 
 
-# Supports of a shaft in a second plane.
-SECOND_PLANE = ("k_A_y", "k_D_y", "k_joint_y")
-
-
 def _own_orders(system: str, values: Mapping[str, Any]) -> Orders | None:
     """The orders that follow from the parameters."""
     if system == "bicardan":
         # A joint under an angle and a torque bends the shaft twice a turn.
         discs = any(np.any(values.get(name) or 0.0) for name in ("Ip_A", "Ip_D", "Ip_joint", "rhoIp"))
-        planes = any(values.get(name) is not None for name in SECOND_PLANE)
-        still = ["without gyroscopic effect"] * discs + ["in the first plane"] * planes
-        return Orders("shaft", {"order 1": 1.0, "order 2 (joints)": 2.0}, " and ".join(still))
+        planes = any(values.get(name) is not None for name in ("k_A_y", "k_D_y", "k_joint_y"))
+        return Orders("shaft", {"order 1": 1.0, "order 2 (joints)": 2.0}, discs, planes)
     if system == "driveline":
         # A joint is excited twice a turn of its input, and less by multiples of it.
         names = {f"order {n * s:.4g} (joints)": n * s for s in joint_speeds(values) for n in (2, 4)}

@@ -268,9 +268,9 @@ def _predictions(atlas: Atlas, system: type[System]) -> Resonances:
     # One of the two ends of a parameter that moves the resonances needs the higher order.
     values = [_predicted(basic, atlas, end) for end in (atlas.lower, atlas.upper)]
     lowest = atlas.lower[atlas.parameters.index(basic.axis)]
-    # A sum of two frequencies lies at twice the order of either.
-    order = math.ceil(np.nanmax(values) / max(float(lowest), 1e-300))
-    return basic.up_to(min(order, _HIGHEST_ORDER))
+    # A sum of two frequencies needs up to twice the order of a single one. NaN: nothing is predicted.
+    order = math.ceil(np.fmax.reduce(np.ravel(values), initial=0.0) / max(float(lowest), 1e-300))
+    return basic.up_to(min(max(order, 1), _HIGHEST_ORDER))
 
 
 def _predicted(resonances: Resonances, atlas: Atlas, point: np.ndarray) -> np.ndarray:

@@ -214,7 +214,7 @@ def _about_orders(dataset: xr.Dataset) -> Iterator[str]:
     factor, unit = suitable("rpm", json.loads(dataset.attrs.get(ASKED, "[]")))
     speeds = orders.speeds(value_in(dataset[name], "Hz").reshape(-1)) * factor
     operating = operating_range(json.loads(dataset.attrs.get("options", "{}")))
-    rest = f" ({orders.frequency})" if orders.still else ""
+    rest = f" ({orders.frequency})" if orders.discs or orders.planes else ""
     if operating:
         low, high = (end * factor for end in operating)
         for sentence in orders.within(speeds, low, high, unit):

@@ -16,7 +16,7 @@ from drivetrain_jax._errors import InputError, aligned, did_you_mean, meant, sho
 from drivetrain_jax._quantities import NamedResults, Variable
 from drivetrain_jax.analysis import OUTCOME, Outcome, Request, analyses_of, analysis_of, get_analysis
 from drivetrain_jax.analysis.floquet.multipliers import VERDICTS
-from drivetrain_jax.resonances import FREQUENCIES, SECOND_PLANE, Orders, in_hertz, operating_range, orders_of
+from drivetrain_jax.resonances import FREQUENCIES, Orders, in_hertz, operating_range, orders_of
 from drivetrain_jax.runs import toml
 from drivetrain_jax.runs.assemble import ResultBuffer
 from drivetrain_jax.runs.axes import entry_of
@@ -438,13 +438,13 @@ _FIRST, _FEW = 6, 3
 
 @dataclass(frozen=True)
 class OrderCrossings:
-    """The ``orders`` with their ``speeds`` (modes, orders) [rpm], the operating range [rpm] if one is given, and what the
-    speeds include beyond the natural frequencies at rest."""
+    """The ``orders`` with their ``speeds`` (modes, orders) [rpm], those of a ``turning`` shaft or of frequencies at rest,
+    and the operating range [rpm] if one is given."""
 
     orders: Orders
     speeds: np.ndarray
     operating: tuple[float, float] | None
-    including: str = ""
+    turning: bool = False
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
@@ -457,8 +457,9 @@ class OrderCrossings:
         modes = [
             [str(k), *(f"{x:.6g}" if np.isfinite(x) else "-" for x in row)] for k, row in enumerate(self.speeds, 1)
         ]
-        how = f"  speed of the {self.orders.shaft} at which an order meets the mode{self.including}"
-        return [how, *aligned([head, *modes])]
+        how = f"  speed of the {self.orders.shaft} at which an order meets the mode"
+        how += ", with the gyroscopic effect" * (self.turning and self.orders.discs)
+        return [how + ", counted over both planes" * (self.turning and self.orders.planes), *aligned([head, *modes])]
 
     def _whirl_sentence(self, values: Mapping[str, Any], speed: float) -> str:
         """Frequencies of whirl at the ``speed`` [rad/s] of the shaft, by their sense, and critical speeds."""
@@ -483,7 +484,9 @@ class OrderCrossings:
         said = [f"From {low:g} to {high:g} rpm {'; '.join(self.orders.within(self.speeds, low, high))}"]
         if {"separation_margin", "required_margin"} <= values.keys():
             near = 1 + np.flatnonzero(values["separation_margin"] < values["required_margin"])
-            modes = f"mode{'s' * (len(near) > 1)} {', '.join(map(str, near))}"
+            modes = (
+                f"mode{'s' * (len(near) > 1)} {', '.join(map(str, near))}{' of the first plane' * self.orders.planes}"
+            )
             said += [f"{modes} lack{'s' * (len(near) == 1)} the required separation margin"] if len(near) else []
         return f"{'; '.join(said)}."
 
@@ -495,22 +498,21 @@ def order_crossings(scene: Scene, parameters: Mapping[str, Any], values: Mapping
     if name is None or orders is None or scene.request.options.get("order"):
         return None
     operating = operating_range(scene.request.options)
-    if orders.still or scene.analysis.name == "whirl":
+    whirl = scene.analysis.name == "whirl"
+    if orders.discs or whirl:
         orders = replace(orders, per_turn={**orders.per_turn, "order -1 (backward)": -1.0})
-        planes = any(parameters.get(name) is not None for name in SECOND_PLANE)
-        speeds = _turning_speeds(scene, parameters, orders, 1 + planes)
-        including = f", with the gyroscopic effect{', counted over both planes' * planes}"
-        return OrderCrossings(orders, speeds, operating, including)
+    if orders.discs or orders.planes or whirl:
+        return OrderCrossings(orders, _turning_speeds(scene, parameters, orders), operating, turning=True)
     frequency = in_hertz(values[name], scene.analysis.variable(name).units)
     return OrderCrossings(orders, orders.speeds(frequency), operating)
 
 
-def _turning_speeds(scene: Scene, parameters: Mapping[str, Any], orders: Orders, planes: int) -> np.ndarray:
-    """Critical speeds [rpm] of the ``orders`` of a shaft with the gyroscopic effect (modes, orders); NaN where none is."""
+def _turning_speeds(scene: Scene, parameters: Mapping[str, Any], orders: Orders) -> np.ndarray:
+    """Critical speeds [rpm] of the ``orders`` of a turning shaft (modes of all planes, orders); NaN where none is."""
     # Local import: other points need no function of a pytree.
     from drivetrain_jax.analyses import analyse
 
-    shaft, modes = scene.system.of(parameters), planes * scene.request.options["modes"]
+    shaft, modes = scene.system.of(parameters), (1 + orders.planes) * scene.request.options["modes"]
     # The modes of whirl are those of both senses.
     modes = -(-modes // 2) if scene.analysis.name == "whirl" else modes
     asked = ({"order": int(n), "modes": modes} for n in orders.per_turn.values())

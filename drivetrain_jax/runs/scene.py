@@ -184,12 +184,11 @@ def load_scene(source: str | Path | Mapping[str, Any] | Scene, overrides: Mappin
         raise InputError(f"axes.{several.shown.name}: changes {names} together; {allowed}")
     _check_path(scene)
     # The analysis checks that request and parameters match.
-    taken = [dimension.name for dimension in scene.dimensions]
+    _ = scene.dimensions
+    taken = {dim for variable in result_variables(scene) for dim in variable.dims}
     if clash := next((axis for axis in axes if axis.dim in taken), None):
         where = f"{'points' if zipped else 'axes'}.{clash.shown.name}"
-        raise InputError(
-            f"{where}: {analysis.name} has a dimension {clash.dim!r}; expected a parameter of another name"
-        )
+        raise InputError(f"{where}: results have a dimension {clash.dim!r}; expected a parameter of another name")
     return scene
 
 

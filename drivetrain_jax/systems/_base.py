@@ -384,8 +384,9 @@ class System(eqx.Module):
             raise ValueError(f"models of {cls.name}: atlas needs floquet as well")
         for analysis, model in cls.models.items():
             orbits = (model.returns or _MODELS.get(analysis)) is ForcedModel
-            for needed in ("state", "displacements") if orbits else ("state",) if analysis == "history" else ():
-                if not getattr(cls, needed):
+            needs = {"state": orbits or analysis == "history", "displacements": orbits}
+            for needed in needs:
+                if needs[needed] and not getattr(cls, needed):
                     raise ValueError(f"models of {cls.name}: {analysis} needs {needed}, an attribute of the class")
 
     def __new__(cls, *values: Any, **given: Any) -> Any:
@@ -504,7 +505,8 @@ def _models(system: type[System], method: Any, marked: Any = None) -> dict[str, 
 
 
 def _admitted(described: Parameter, value: Any) -> Any:
-    """``value`` in its stored type, or :class:`InputError`; arrays and traced values are unchanged, except for lists."""
+    """``value`` in its stored type, or :class:`InputError`. A list becomes a tuple of its entries, traced or not; other
+    arrays and traced values are unchanged."""
     if value is None:
         if described.default is None and not described.derived:
             raise InputError(f"{described.name}: missing; expected {described.allowed_in_units}")

@@ -237,7 +237,10 @@ _LEVEL, _ALIKE = 1e-12, 1e-9
 
 
 def range_of(function: Callable[[Any], Any], period: Any) -> Any:
-    """Largest minus smallest value of a smooth function of that ``period``, ``(...)``, by samples and Newton's method."""
+    """Largest minus smallest value of a smooth function of that ``period``, ``(...)``, by samples and Newton's method.
+
+    A peak narrower than a few samples may be missed: behind a gear of hundreds of teeth the range may be 0.1 % too small.
+    """
     step, size = jnp.asarray(period, float) / _SAMPLES, _SAMPLES // _PARTS
     sign = jnp.array([1.0, -1.0]).reshape(-1, *(1,) * step.ndim)
     slope = lambda t: jax.jvp(function, (t,), (jnp.ones_like(t),))[1]  # noqa: E731
@@ -247,9 +250,11 @@ def range_of(function: Callable[[Any], Any], period: Any) -> Any:
         number = (part * size + jnp.arange(-1, size + 1)).reshape(-1, *(1,) * step.ndim)
         # XLA would compute them again for each of their uses.
         values = jax.lax.optimization_barrier(jax.lax.stop_gradient(function(step * number)))
-        heights = sign * values[:, None]
-        lower = (heights[1:-1] < heights[:-2]) | (heights[1:-1] < heights[2:])
-        peaks = jnp.where(lower, -jnp.inf, heights[1:-1])
+        before, here, after = (sign * values[k : k + size, None] for k in range(3))
+        # The vertex of the parabola: the sample next to a lower peak may lie above that next to the highest one.
+        bent = 2 * here - before - after
+        vertex = here + (before - after) ** 2 / (8 * jnp.where(bent > 0, bent, jnp.inf))
+        peaks = jnp.where((here < before) | (here < after), -jnp.inf, vertex)
         return jnp.max(peaks, axis=0), step * (part * size + jnp.argmax(peaks, axis=0))
 
     def nearer(_: int, t: Array) -> Array:
@@ -257,7 +262,6 @@ def range_of(function: Callable[[Any], Any], period: Any) -> Any:
         moved = t - first / jnp.where(second == 0, jnp.inf, second)
         return jnp.clip(moved, start - step, start + step)
 
-    # The sample next to a lower peak may lie above that next to the highest one.
     tops, start = jax.lax.map(highest, jnp.arange(_PARTS))
     extremes = sign * function(jax.lax.fori_loop(0, 4, nearer, start))
     return jnp.maximum(jnp.sum(_largest(jnp.where(tops == -jnp.inf, -jnp.inf, extremes)), axis=0), 0.0)
@@ -265,7 +269,8 @@ def range_of(function: Callable[[Any], Any], period: Any) -> Any:
 
 @jax.custom_jvp
 def _largest(values: Array) -> Array:
-    """The largest of ``values`` along the first axis; no derivative where equal ones move apart."""
+    """The largest of ``values`` along the first axis; no derivative where equal ones move apart. As the rule compares
+    tangents, only forward derivatives exist."""
     return jnp.max(values, axis=0)
 
 

@@ -140,7 +140,7 @@ def test_the_message_about_a_folder_names_its_kind(tmp_path, name, file, told):
         open_result(tmp_path / name)
 
 
-def test_a_pipe_is_no_file():
+def test_a_device_is_no_result():
     with pytest.raises(InputError, match="not a readable"):
         open_result(Path("/dev/null"))
 

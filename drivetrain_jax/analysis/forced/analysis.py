@@ -3,7 +3,7 @@
 Linear: the variational equations over one period T from rest give ``y(T; y0) = r + Z y0``, hence ``y0 = (I - Z)^-1 r``.
 Nonlinear: continuation along growing forcing (:func:`~drivetrain_jax.analysis.forced.orbit.along_forcing`), and along
 the speed of the system, if it has one, from below and from above (:func:`~drivetrain_jax.analysis.forced.orbit.neighbours`),
-unless the first orbit is nearly the linear response. Of several orbits the result is the stable one of the smallest
+unless the first path ends near the linear response. Of several orbits the result is the stable one of the smallest
 amplitude, or the smallest one if none is stable; ``orbit_count`` is their number. Orbits on branches that these paths do
 not meet are not found.
 
@@ -327,18 +327,20 @@ def nonlinear_orbit(
     """The stable periodic orbit of the smallest amplitude, or the smallest one if none is stable.
 
     The orbits are that on the path that starts along ``response``, and those near the states ``search(wanted)`` (m, n).
-    They are wanted where the first orbit is not nearly the linear response, or was not found. Without a ``response`` the
+    They are wanted where the path does not end, or not near the linear response. Without a ``response`` the
     orbit is NaN and has the outcome of ``response``.
     """
     usable = response.outcome < Outcome.NOT_CONVERGED
     start = jnp.where(usable, response.state, 0.0)
-    unit = _unit(start)
+    # Nonlinearity matters for states of order one; a smaller response is measured in units of its own size.
+    unit = jax.lax.stop_gradient(jnp.minimum(size_of(start), 1.0))
     first = unit * along_forcing(in_units_of(unit, model.field), model.period, start.size)
     bend = jnp.max(jnp.abs(first - start)) / size_of(start)
     guesses = jnp.concatenate([first[None], search(usable & ~(bend <= LEAST_BEND))])
     guesses = jnp.where(usable & distinct(guesses, NEAR)[:, None], guesses, jnp.nan)
     # One after another, because points have few: in a batch, a missing orbit would cost as much as one.
-    every = jax.lax.map(partial(_near, model, rtol, rows), guesses)
+    units = jnp.ones(len(guesses)).at[0].set(unit)
+    every = jax.lax.map(lambda near: _near(model, rtol, rows, *near), (guesses, units))
     exists = every.orbit.outcome < Outcome.NOT_CONVERGED
     unstable = every.radius > 1 + STABLE_MARGIN
     amplitude = every.largest[:, : len(model.displacements)]
@@ -363,15 +365,9 @@ def orbits_near(model: ForcedModel, guesses: Array, rtol: float) -> Found:
     return jax.vmap(partial(_near, model, rtol, rows))(guesses)
 
 
-def _unit(state: Array) -> Array:
-    """The unit of states near ``state``: nonlinearity matters for states of order one, smaller ones have their own size."""
-    return jax.lax.stop_gradient(jnp.minimum(size_of(state), 1.0))
-
-
-def _near(model: ForcedModel, rtol: float, rows: Array, guess: Array) -> Found:
-    """The orbit to which Newton's method leads from ``guess``, corrected by its closing error, with the largest
-    ``|row . y|`` and its spectral radius."""
-    unit = _unit(guess)
+def _near(model: ForcedModel, rtol: float, rows: Array, guess: Array, unit: Any = 1.0) -> Found:
+    """The orbit to which Newton's method leads from ``guess``, in this ``unit``, corrected by its closing error, with the
+    largest ``|row . y|`` and its spectral radius."""
     orbit = corrected(
         in_units_of(unit, model.field), guess / unit, model.period, _sharpness(rtol, TRANSITION_SHARPNESS)
     )

@@ -12,7 +12,7 @@ least for one second) or more than 2e6; ``NOT_FINITE`` if the field is not finit
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -177,11 +177,17 @@ def _averaged(system: type[System], request: Request, values: Mapping[str, Any],
     return finite_results({name: results[name] for name in request.outputs} | {"outcome": _outcome(flow, history)})
 
 
+def _flow(system: type[System], values: Mapping[str, Any]) -> Flow:
+    """The flow of one point, with the components of the system's state."""
+    flow = system.models["history"].build(values)
+    if isinstance(flow, Flow) and system.state_axis is None and flow.size != (size := len(system.state)):
+        raise InputError(f"system: its flow has {flow.size} components; expected one for each of its state, {size}")
+    return flow
+
+
 def _solve(system: type[System], request: Request, values: Mapping[str, Any], effort: Array) -> dict[str, Array]:
     """All requested results of one point; ``effort`` only orders the batches, as the integration is adaptive."""
-    flow: Flow = system.models["history"].build(values)
-    if system.state_axis is None and flow.size != (size := len(system.state)):
-        raise InputError(f"system: its flow has {flow.size} components; expected one for each of its state, {size}")
+    flow = _flow(system, values)
     history = integrated(flow, request)
     scale = jnp.stack([jnp.asarray(s, float) for s in flow.scale or (1.0,) * flow.size])
     results = _by_component(system, scale * history.states, "") | _by_component(system, scale * history.error, "_error")
@@ -199,12 +205,12 @@ def _by_component(system: type[System], values: Array, suffix: str) -> dict[str,
 def _effort(system: type[System], request: Request, most: float, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Predicted segments, shape (N,): strobes or periods, and requested times; infinite beyond ``most`` strobes."""
     times = requested_times(request)
-    strobes = times[-1] / predicted(_period, (system.models["history"].build,), columns)
+    strobes = times[-1] / predicted(_period, (system,), columns)
     return np.where(strobes <= most, np.ceil(strobes) + len(times), np.inf)
 
 
-def _period(build: Callable[..., Any], values: Mapping[str, Any]) -> Array:
-    return jnp.asarray(build(values).period)
+def _period(system: type[System], values: Mapping[str, Any]) -> Array:
+    return jnp.asarray(_flow(system, values).period)
 
 
 def _outcome(flow: Flow, history: History) -> Array:
