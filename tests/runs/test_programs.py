@@ -154,7 +154,8 @@ def test_a_second_answer_neither_compiles_nor_imports_much(tmp_path):
     for command in (point, ["query", file, "beta=0.1", "Omega=1.1"]):
         assert int(lines(COMMAND, tmp_path, *command)[0]) > 0
         compiled, small, _, *modules = lines(COMMAND, tmp_path, *command)
-        assert compiled == "0" and int(small) <= 3 and not HEAVY & set(modules)
+        # The gradient by the data of a question is six programs of one operation each, 60 ms in all.
+        assert compiled == "0" and int(small) <= 10 and not HEAVY & set(modules)
     assert lines(COMMAND, tmp_path, "plot", file, "--out", figures[0])[2] == "1"
     # The curves of a read-only atlas are kept as well, but not those of another part of it.
     Path(file).chmod(0o444)
