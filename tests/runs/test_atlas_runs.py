@@ -411,7 +411,9 @@ def test_the_same_point_in_physical_units(atlas):
         atlas_answers.query(atlas, {**shaft, "speed": rpm})
     with pytest.raises(dt.InputError, match=r"^k1: missing; Omega = speed sqrt\(J1/k1\) needs k1$"):
         atlas_answers.query(atlas, {"J1": 1.0, "speed": 100.0})
-    with pytest.raises(dt.InputError, match=r"^k2 = 2000 N m/rad: the atlas is made for k2 = 1000 N m/rad; expected that"):
+    with pytest.raises(
+        dt.InputError, match=r"^k2 = 2000 N m/rad: the atlas is made for k2 = 1000 N m/rad; expected that"
+    ):
         atlas_answers.query(atlas, {**shaft, "k2": 2000.0, "speed": rpm, "angle": 10.0})
     with pytest.raises(dt.InputError, match=r"^beta = 0\.1: given besides angle; expected one of the two$"):
         atlas_answers.query(atlas, {**shaft, "speed": rpm, "angle": 10.0, "beta": 0.1})

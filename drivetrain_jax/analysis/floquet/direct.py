@@ -66,7 +66,8 @@ class Monodromy(NamedTuple):
     its spectral radius, is within the target or the limit of rounding. ``residual`` is det Z
     minus its exact value (Liouville) in units of the n-th power of a lower bound of the spectral radius; 0 if the exact
     value is not known. ``change`` is the error of ``matrix`` entry by entry, with a safety factor of four: the distance of
-    the finer result from the limit extrapolated from both results, or None without a second result.
+    the finer result from the limit extrapolated from both results, or None without a second result. ``scales`` ``(n, ...)``
+    are units of the states in which rows and columns of ``matrix`` have similar sizes, or None if they have.
     """
 
     matrix: Array
@@ -76,12 +77,18 @@ class Monodromy(NamedTuple):
     residual: Array
     change: Array | None = None
     truncation: Array | None = None
+    scales: Array | None = None
+
+    @property
+    def balanced(self) -> Array:
+        """``matrix`` in the units ``scales``: its eigenvalues are less wrong by rounding."""
+        return self.matrix if self.scales is None else scaled(self.matrix, self.scales)
 
 
 def unknown(n: int) -> Monodromy:
     """The matrix of one point before any solution."""
-    zero, none = jnp.zeros(()), jnp.zeros((n, n))
-    return Monodromy(none, zero, PolynomialError(jnp.full(n, jnp.inf), zero), jnp.array(False), zero, none, zero)
+    zero, none, bound = jnp.zeros(()), jnp.zeros((n, n)), jnp.full(n, jnp.inf)
+    return Monodromy(none, zero, PolynomialError(bound, zero), jnp.array(False), zero, none, zero, jnp.ones(n))
 
 
 def assemble(ends: Array | None, phi: Array) -> Array:
@@ -110,7 +117,7 @@ def _balance(size: Array) -> Array:
     return jax.lax.fori_loop(0, 2 * n, balanced, jnp.ones_like(size[0]))
 
 
-def _scaled(matrix: Array, scales: Array) -> Array:
+def scaled(matrix: Array, scales: Array) -> Array:
     """A matrix of states in the units ``scales``."""
     return matrix * scales / scales[:, None]
 
@@ -141,7 +148,7 @@ def compare(
     # Entries that vanish are as wrong as their terms.
     scales = stored(_balance)(sizes(jnp.maximum(jnp.abs(fine.matrix), fine.terms)))
     plain = z_fine, z_fine - z_coarse
-    z_fine, z_coarse, size = (stored(_scaled)(matrix, scales) for matrix in (z_fine, z_coarse, size))
+    z_fine, z_coarse, size = (stored(scaled)(matrix, scales) for matrix in (z_fine, z_coarse, size))
     norm = jnp.sqrt(square_sum(size))
     centre = jnp.asarray(sum(z_fine[i, i] for i in range(n))) / n
     shift = centre * np.eye(n).reshape(n, n, *(1,) * centre.ndim)
@@ -183,6 +190,6 @@ def compare(
     largest_slope = reduce(jnp.maximum, (slopes[k] / scale**k for k in range(1, n)), 1.0)
     met = truncation <= jnp.maximum(rtol, rounding(largest_slope) + of_entries)
     # The propagator itself keeps the units of its states.
-    matrix, change = plain if ends is None else (z_fine, apart)
+    matrix, change, scales = (*plain, scales) if ends is None else (z_fine, apart, jnp.ones_like(scales))
     error = PolynomialError(jnp.stack(errors), centre)
-    return Monodromy(matrix, log_scale, error, met, residual, (4 / (gain - 1)) * change, truncation)
+    return Monodromy(matrix, log_scale, error, met, residual, (4 / (gain - 1)) * change, truncation, scales)

@@ -206,16 +206,16 @@ def results(
     """
     wanted = set(outputs)
     finite = jnp.all(jnp.isfinite(z.matrix), axis=(0, 1))
-    size = jnp.exp(z.log_scale)
+    size, balanced = jnp.exp(z.log_scale), z.balanced
 
     def eigen() -> Spectrum:
-        return spectrum or eigenvalues(jnp.where(finite, z.matrix, jnp.nan))
+        return spectrum or eigenvalues(jnp.where(finite, balanced, jnp.nan))
 
     undamped = finite & model.is_hamiltonian()
     if wanted & MULTIPLIERS:
         spectrum = eigen()
-    if spectrum is None and has_closed_form(z.matrix):
-        rho, error, bounded = radius_in_closed_form(z.matrix, z.error, size, undamped, 10 * rtol)
+    if spectrum is None and has_closed_form(balanced):
+        rho, error, bounded = radius_in_closed_form(balanced, z.error, size, undamped, 10 * rtol)
     else:
         rho, error = radius_by_eigenvalues(eigen(), z.error)
         none = jnp.zeros_like(finite)
