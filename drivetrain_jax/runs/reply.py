@@ -174,7 +174,7 @@ def radius_sensitivities(asked: AtlasQuery, slopes: Mapping[str, float] | None) 
 
 
 def differentiable(results: Iterable[Variable]) -> list[Variable]:
-    """Those of ``results`` that may have derivatives and a table: numbers with at most one dimension."""
+    """The ``results`` that may have derivatives and a table: numbers with at most one dimension."""
     numbers = [v for v in results if v.dtype == "float64" and len(v.dims) < 2]
     return [v for v in numbers if not v.name.endswith(("_error", "_residual", "_margin"))]
 

@@ -384,9 +384,8 @@ class System(eqx.Module):
             raise ValueError(f"models of {cls.name}: atlas needs floquet as well")
         for analysis, model in cls.models.items():
             orbits = (model.returns or _MODELS.get(analysis)) is ForcedModel
-            needs = {"state": orbits or analysis == "history", "displacements": orbits}
-            for needed in needs:
-                if needs[needed] and not getattr(cls, needed):
+            for needed, asked in (("state", orbits or analysis == "history"), ("displacements", orbits)):
+                if asked and not getattr(cls, needed):
                     raise ValueError(f"models of {cls.name}: {analysis} needs {needed}, an attribute of the class")
 
     def __new__(cls, *values: Any, **given: Any) -> Any:

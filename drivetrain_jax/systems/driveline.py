@@ -248,7 +248,7 @@ def range_of(function: Callable[[Any], Any], period: Any) -> Any:
     def highest(part: Array) -> tuple[Array, Array]:
         """Of the function and of its negative, the highest peak among the samples of a part, -inf without one, and where."""
         number = (part * size + jnp.arange(-1, size + 1)).reshape(-1, *(1,) * step.ndim)
-        # XLA would compute them again for each of their uses.
+        # Without the barrier XLA would compute the values again for each of their uses.
         values = jax.lax.optimization_barrier(jax.lax.stop_gradient(function(step * number)))
         before, here, after = (sign * values[k : k + size, None] for k in range(3))
         # The vertex of the parabola: the sample next to a lower peak may lie above that next to the highest one.

@@ -82,7 +82,7 @@ class Monodromy(NamedTuple):
     @property
     def balanced(self) -> Array:
         """``matrix`` in the units ``scales``: its eigenvalues are less wrong by rounding."""
-        return self.matrix if self.scales is None else scaled(self.matrix, self.scales)
+        return self.matrix if self.scales is None else _scaled(self.matrix, self.scales)
 
 
 def unknown(n: int) -> Monodromy:
@@ -117,7 +117,7 @@ def _balance(size: Array) -> Array:
     return jax.lax.fori_loop(0, 2 * n, balanced, jnp.ones_like(size[0]))
 
 
-def scaled(matrix: Array, scales: Array) -> Array:
+def _scaled(matrix: Array, scales: Array) -> Array:
     """A matrix of states in the units ``scales``."""
     return matrix * scales / scales[:, None]
 
@@ -148,7 +148,7 @@ def compare(
     # Entries that vanish are as wrong as their terms.
     scales = stored(_balance)(sizes(jnp.maximum(jnp.abs(fine.matrix), fine.terms)))
     plain = z_fine, z_fine - z_coarse
-    z_fine, z_coarse, size = (stored(scaled)(matrix, scales) for matrix in (z_fine, z_coarse, size))
+    z_fine, z_coarse, size = (stored(_scaled)(matrix, scales) for matrix in (z_fine, z_coarse, size))
     norm = jnp.sqrt(square_sum(size))
     centre = jnp.asarray(sum(z_fine[i, i] for i in range(n))) / n
     shift = centre * np.eye(n).reshape(n, n, *(1,) * centre.ndim)
